@@ -1,0 +1,57 @@
+"""What every benchmark shares: its options, its JSON file and its way of printing a table.
+
+One file, one question, one command: `--seed`, `--trials` where trials are drawn, `--quick`, `--plots DIR`,
+`--json FILE`. Figures are numbers under fixed names; one that could not be had is absent.
+"""
+
+import argparse
+import importlib.metadata
+import math
+import platform
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxtri.io import write_json
+
+PACKAGES = ("jaxtri", "jax", "jaxlib", "equinox", "optimistix", "jaxlie", "numpy", "opencv-python-headless")
+
+
+def parser(question: str, *, trials: int | None = None, data: bool = False) -> argparse.ArgumentParser:
+    """The options of a benchmark."""
+    p = argparse.ArgumentParser(description=question)
+    p.add_argument("--seed", type=int, default=0)
+    if trials is not None:
+        p.add_argument("--trials", type=int, default=trials)
+    if data:
+        p.add_argument("--data", type=Path, default=Path("../shared/data"), help="folder of the sequences")
+    p.add_argument("--quick", action="store_true", help="under a minute: fewer sequences, frames or trials")
+    p.add_argument("--plots", type=Path, metavar="DIR", help="write figures here")
+    p.add_argument("--json", type=Path, metavar="FILE", help="write the figures here")
+    return p
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and the packages that matter."""
+    return {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in PACKAGES}
+
+
+def report(path: Path | None, figures: dict[str, float]) -> None:
+    """Write the figures, those that are numbers, as the contract has it."""
+    if path is not None:
+        finite = {k: float(v) for k, v in figures.items() if v is not None and math.isfinite(v)}
+        write_json(path, {"command": " ".join(sys.argv), "versions": versions(), "figures": finite})
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Columns aligned: text to the left, numbers to the right."""
+    cells = [[str(c) for c in row] for row in [head, *rows]]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
+    lines = [
+        "  ".join(
+            c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in cells
+    ]
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(lines)

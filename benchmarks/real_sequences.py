@@ -1,0 +1,157 @@
+"""How far is the recovered trajectory from the truth on real video, with the shipped defaults?
+
+    python benchmarks/real_sequences.py --data ../shared/data
+
+The same settings for every sequence. Peers beside ours are single runs with the same intrinsics; `pnp` is a
+two-view start, PnP per frame and landmarks triangulated once.
+"""
+
+import warnings
+from pathlib import Path
+
+import jax
+import numpy as np
+from contract import parser, report, table
+
+jax.config.update("jax_enable_x64", True)
+
+from jaxtri.bases import Base  # noqa: E402
+from jaxtri.io import read_camera, read_tum  # noqa: E402
+from jaxtri.pipeline import Run, follow_tracks, track  # noqa: E402
+from jaxtri.trajectory import Evaluation, evaluate  # noqa: E402
+from jaxtri.vision.video import open_source  # noqa: E402
+
+# ATE in % of the path: essential, pnp, window, isam2, svo (causal), full BA, COLMAP (batch).
+PEERS = {
+    "aerial_semisynthetic_a": (3.58, 0.037, 0.024, 0.026, 0.049, 0.035, 0.019),
+    "ar_chessboard": (5.5, 0.203, 0.184, 0.149, 0.115, 0.142, 0.127),
+    "driving_kitti00": (0.62, 0.209, 0.468, 0.364, 1.47, 0.460, 0.314),
+    "indoor_7scenes_kitchen": (2.67, 0.656, 0.847, 1.14, 0.748, 0.618, 0.583),
+    "indoor_tsukuba_rendered": (1.30, 0.157, 0.299, 0.255, 0.202, 0.196, 0.146),
+    "rig_temple": (1.48, 0.182, 0.179, 0.373, 4.7, 0.096, 0.253),
+}
+NAMES = ("essential", "pnp", "window", "isam2", "svo", "full BA", "COLMAP")
+ROTATION = "rotation_7scenes_kitchen"
+ROTATION_PEERS = "orientation RMSE in degrees: pnp 1.50, window 1.61, isam2 1.54, svo .91 (92 %), full BA .34"
+
+
+def run_sequence(folder: Path, base: Base) -> tuple[Run, Evaluation, float]:
+    """The run, its errors, and the share of frames with a pose of the first scale."""
+    camera = read_camera(folder / "camera.json")
+    with open_source(folder) as source:
+        run = track(source, camera, base=base, progress=False)
+    posed = np.array([p.T_camera_world is not None for p in run.odometry.poses])
+    one_scale = len(posed) if run.odometry.scale_unknown_from is None else run.odometry.scale_unknown_from
+    coverage = posed[:one_scale].sum() / len(posed)
+    return run, evaluate(run.trajectory, read_tum(folder / "groundtruth.txt")), float(coverage)
+
+
+def dinosaur(folder: Path) -> dict[str, float]:
+    """The turntable: 36 views of a full circle from given tracks."""
+    data = np.load(folder / "tracks.npz")
+    camera = read_camera(folder / "camera.json", width=720, height=576)
+    odometry = follow_tracks(camera, data["xy"], data["visible"])
+    estimate = odometry.trajectory()
+    truth = data["Twc"]
+    R, R_true = estimate.rotations, truth[:, :3, :3]
+    step = np.swapaxes(R[:-1], 1, 2) @ R[1:]
+    step_true = np.swapaxes(R_true[:-1], 1, 2) @ R_true[1:]
+
+    def angle(M: np.ndarray) -> np.ndarray:
+        return np.rad2deg(np.arccos(np.clip((np.trace(M, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
+
+    whole = R[0].T @ R[-1]
+    whole_true = R_true[0].T @ R_true[-1]
+    errors = evaluate(estimate, read_tum(folder / "groundtruth.txt"))
+    posed = sum(p.T_camera_world is not None for p in odometry.poses)
+    return {
+        "coverage": posed / len(truth),
+        "segments": odometry.segments,
+        "step_rotation_error_deg": float(angle(np.swapaxes(step_true, 1, 2) @ step).mean()),
+        "closing_error_deg": float(angle(whole_true.T @ whole)),
+        "ate_percent": errors.ate_percent,
+    }
+
+
+def main() -> None:
+    options = parser(__doc__.splitlines()[0], data=True)
+    options.add_argument(
+        "--bases", nargs="+", default=[b.value for b in Base], help="kinds of base to compare"
+    )
+    args = options.parse_args()
+    folders = [args.data / name for name in [*PEERS, ROTATION] if (args.data / name).is_dir()]
+    if not folders:
+        raise SystemExit(f"{args.data}: none of the sequences is there; give their folder by --data")
+    if args.quick:
+        folders = folders[3:4] + folders[5:6]
+        args.bases = ["tracks"]
+    figures: dict[str, float] = {}
+    for kind in args.bases:
+        rows, ratios = [], []
+        prefix = "" if kind == "tracks" else f"{kind}."
+        for folder in folders:
+            name = folder.name
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                run, errors, coverage = run_sequence(folder, Base(kind))
+            fps = float(run.statistics["frames_per_second"])  # pyright: ignore[reportArgumentType]
+            figures |= {
+                f"{prefix}{name}.coverage": coverage,
+                f"{prefix}{name}.segments": run.odometry.segments,
+                f"{prefix}{name}.restarts": run.odometry.changes,
+                f"{prefix}{name}.ate_percent": errors.ate_percent,
+                f"{prefix}{name}.rotation_rmse_deg": errors.rotation_rmse_deg,
+                f"{prefix}{name}.rpe_translation_percent": errors.rpe_translation_percent,
+                f"{prefix}{name}.rpe_rotation_deg": errors.rpe_rotation_deg,
+                f"{prefix}{name}.fps": fps,
+            }
+            row = [
+                name,
+                f"{coverage:.0%}",
+                run.odometry.segments,
+                run.odometry.changes,
+                f"{errors.ate_percent:.3f}",
+            ]
+            row += [f"{errors.rpe_translation_percent:.1f}", f"{errors.rpe_rotation_deg:.4f}"]
+            row += [f"{errors.rotation_rmse_deg:.2f}", f"{fps:.0f}"]
+            if name in PEERS:
+                ratio = errors.ate_percent / PEERS[name][1]
+                ratios.append(ratio)
+                row += [f"{ratio:.2f}", *(f"{p:g}" for p in PEERS[name])]
+            else:
+                row += [""] * (1 + len(NAMES))
+            rows.append(row)
+            print(f"  {kind}: {name} {errors.ate_percent:.3f} %", flush=True)
+        head = [
+            "sequence",
+            "cover",
+            "starts",
+            "restarts",
+            "ATE %",
+            "RPE t %",
+            "RPE r deg",
+            "rot deg",
+            "fps",
+            "ATE/pnp",
+        ]
+        print(f"\nbase: {kind}\n" + table(head + list(NAMES), rows))
+        if ratios:
+            figures[f"{prefix}geomean_ate_vs_pnp"] = float(np.exp(np.mean(np.log(ratios))))
+            print(
+                f"geometric mean of ATE / pnp over {len(ratios)} sequences: {figures[f'{prefix}geomean_ate_vs_pnp']:.3f}"
+            )
+        print(f"{ROTATION}: {ROTATION_PEERS}\n", flush=True)
+    circle = args.data / "tracks_oxford_dinosaur"
+    if circle.is_dir():
+        found = dinosaur(circle)
+        figures |= {f"tracks_oxford_dinosaur.{k}": v for k, v in found.items()}
+        print(
+            f"tracks_oxford_dinosaur: {found['coverage']:.0%} of the circle in {found['segments']:.0f} start(s), "
+            f"{found['step_rotation_error_deg']:.3f} degrees mean rotation error per step (of 10), "
+            f"{found['closing_error_deg']:.2f} degrees after the whole circle, ATE {found['ate_percent']:.2f} %"
+        )
+    report(args.json, figures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,15 @@
+"""Differentiable filters that recover a camera's motion from a monocular video.
+
+Conventions, written here once:
+
+- Axes are OpenCV's: x right, y down, z forward. The world is the camera frame of the first base frame.
+- A pose maps world to camera, `X_camera = R X_world + T` (Yu et al. 2006, eq. 3), and is named
+  `T_camera_world`. Trajectories and their files are camera to world, named `T_world_camera`.
+- The filters work in normalised image coordinates (intrinsics and distortion removed). Pixels exist in
+  `Camera` and `jaxtri.vision` only; the centre of the top-left pixel is (0, 0). Noise is given in pixels.
+- Array axes: frame t, point n, component. Functions take one item; batch them with `jax.vmap`.
+- Angles are in radians, time in frames unless a `dt` is given, lengths in units of the scene.
+- The scale of a monocular reconstruction is a gauge, fixed by the length of the first base line.
+- Missing is False in a boolean mask; what stands in a masked entry changes nothing, NaN included.
+- The dtype follows the inputs; nothing here touches `jax.config`.
+"""

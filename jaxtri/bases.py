@@ -1,0 +1,450 @@
+"""The two ways to choose base frames, behind one interface for the driver: per track, or one pair for all."""
+
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxlie import SE3
+from jaxtyping import Array, Float
+
+from jaxtri import segments, tracker
+from jaxtri.ekf import Diagnostics
+from jaxtri.geometry.epipolar import inverse_depth
+from jaxtri.geometry.pose import compose
+from jaxtri.models.base_pairs import BasePoint, base_point
+from jaxtri.tracker import Report, Settings, Status
+from jaxtri.two_view import TwoView, refine
+from jaxtri.vision.initialise import Hypothesis, hypotheses
+
+
+class Base(Enum):
+    """Which two base frames a track is measured from."""
+
+    TRACKS = "tracks"  # a pair per track, drawn from keyframes
+    INHERIT = "inherit"  # one pair for all; a restart takes two frames already tracked
+    PAPER = "paper"  # one pair for all; a restart takes two consecutive frames and matches the scale
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """When a base pair is good enough; see `jaxtri.vision.initialise`."""
+
+    flow: float = 0.035  # median flow between the two frames, as a share of the image width
+    parallax_deg: float = 1.0  # median angle between the two rays of a point
+    points: int = 20  # fewest tracks that agree on the motion
+    common: float = 0.15  # share of the tracks that must survive; below it a later first frame is taken
+    restart: float = 0.35  # share of a pair's tracks below which a segment ends (inherit, paper)
+    overlap: int = 1  # frames that two segments share (paper)
+    eight_point: bool = False  # the 8-point algorithm with RANSAC, as in the paper
+
+    @classmethod
+    def of(cls, base: Base, **changes: Any) -> "StartSettings":
+        """The defaults of a kind of base; the paper's starts from the first two frames that move at all."""
+        if base is Base.PAPER:
+            changes = {"flow": 0.003, "parallax_deg": 0.1, "eight_point": True} | changes
+        return cls(**changes)
+
+
+class Frame(NamedTuple):
+    """The tracks of one frame, normalised, in slots."""
+
+    index: int
+    time: float
+    u: np.ndarray  # (n, 2)
+    visible: np.ndarray  # (n,)
+    fresh: np.ndarray  # (n,)
+    ids: np.ndarray  # (n,)
+
+    def common(self, other: "Frame") -> np.ndarray:
+        """Slots that hold the same track in both frames."""
+        return self.visible & other.visible & (self.ids == other.ids)
+
+
+_init = jax.jit(tracker.init)
+_step = jax.jit(tracker.step)
+_segment_init = jax.jit(segments.init)
+_segment_step = jax.jit(segments.step)
+_refine = jax.jit(refine)
+_depths = jax.jit(segments.depths)
+_common_scale = jax.jit(segments.common_scale)
+
+
+class Start(NamedTuple):
+    """A base pair, or the reason why there is none yet."""
+
+    pose: TwoView | None
+    reason: str
+
+
+def find(settings: Settings, start: StartSettings, frames: list[Frame]) -> Start:
+    """Relative pose of the first and the last of `frames`, or why it has to wait.
+
+    Of the hypotheses that explain the pair about equally well (before a plane there are two) the frames
+    between decide, by how well the transfer reaches them.
+    """
+    first, last = frames[0], frames[-1]
+    common = first.common(last)
+    if common.sum() < start.points:
+        return Start(
+            None, f"only {int(common.sum())} tracks are common to two frames, {start.points} are needed"
+        )
+    threshold = float(settings.epipolar_gate)
+    found = hypotheses(first.u, last.u, common, settings.sigma, threshold, eight_point=start.eight_point)
+    if not found:
+        return Start(None, "no essential matrix fits the tracks")
+    between = [
+        frames[int(k)] for k in np.linspace(0, len(frames) - 1, 5).round()[1:-1] if 0 < k < len(frames) - 1
+    ]
+    rivals = [h for h in found if h.cost < 1.5 * found[0].cost + 50]
+    if between and len(rivals) > 1:
+        rivals.sort(key=lambda h: h.cost + _transfer_cost(settings, h, first, last, between))
+    best = rivals[0]
+    if best.inside.sum() < max(start.points, 0.4 * common.sum()):
+        return Start(None, f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion")
+    if not best.parallax_deg >= start.parallax_deg:
+        return Start(
+            None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed"
+        )
+    return Start(best.pose, "")
+
+
+def _transfer_cost(
+    settings: Settings, h: Hypothesis, first: Frame, last: Frame, between: list[Frame]
+) -> float:
+    """Truncated squared distances of the points transferred to the frames between the pair."""
+    pose = compose(h.pose.rotation, h.pose.translation)
+    state = _init(
+        settings,
+        jnp.asarray(first.u),
+        jnp.asarray(last.u),
+        jnp.asarray(h.inside),
+        pose,
+        world=_identity(settings),
+    )
+    cost, before = 0.0, first.index
+    for frame in between:
+        visible = first.common(frame) & h.inside
+        state, report = hold(settings, state, frame, visible, float(frame.index - before))
+        distance = np.where(np.asarray(report.diagnostics.distance) < 16, report.diagnostics.distance, 16.0)
+        measured = visible & np.asarray(state.tracks.usable)
+        cost += float(distance[measured].sum()) + 16.0 * float((visible & ~measured).sum())
+        before = frame.index
+    return cost
+
+
+def _identity(settings: Settings) -> SE3:
+    return jax.tree.map(lambda x: x.astype(settings.sigma.dtype), SE3.identity())
+
+
+def fill(
+    settings: Settings, frames: list[Frame], pose: SE3, world: SE3, dt: list[float]
+) -> tuple[tracker.State, list[tuple[Frame, Report]]]:
+    """Set up the tracker on the first and last of `frames`, whose relative pose is given, and run it over them.
+
+    Reports of all frames but the first, whose pose is `world`.
+    """
+    first, last = frames[0], frames[-1]
+    common = first.common(last)
+    state = _init(settings, jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(common), pose, world=world)
+    reports = []
+    for frame, elapsed in zip(frames[1:], dt, strict=True):
+        state, report = hold(settings, state, frame, first.common(frame) & common, elapsed)
+        reports.append((frame, report))
+    return state, reports
+
+
+def hold(
+    settings: Settings, state: tracker.State, frame: Frame, visible: np.ndarray, dt: float
+) -> tuple[tracker.State, Report]:
+    """One frame measured with the tracks as they are: none begins, no keyframe is made."""
+    none = jnp.zeros(len(visible), bool)
+    return _step(
+        settings, state, jnp.asarray(frame.u), jnp.asarray(visible), none, dt, hold=jnp.asarray(True)
+    )
+
+
+@jax.jit
+def _world_points(base: BasePoint, sigma: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """World points of base pairs, and the covariance of each."""
+
+    def one(base: BasePoint) -> tuple[jax.Array, jax.Array]:
+        w = jnp.where(jnp.abs(base.point[3]) > 1e-9, base.point[3], 1e-9)
+        J = (base.spread[:3] - jnp.outer(base.point[:3] / w, base.spread[3])) / w
+        return base.point[:3] / w, jnp.square(sigma) * J @ J.T
+
+    return jax.vmap(one)(base)
+
+
+class Points(NamedTuple):
+    """Triangulated points: `ids` (n,) of their tracks, `xyz` (n, 3) in the world, `covariance` (n, 3, 3)."""
+
+    ids: np.ndarray
+    xyz: np.ndarray
+    covariance: np.ndarray
+
+
+def _points(base: BasePoint, good: np.ndarray, ids: np.ndarray, settings: Settings) -> Points:
+    xyz, covariance = (np.asarray(x) for x in _world_points(base, settings.sigma))
+    good = good & (np.asarray(base.point)[:, 3] > 1e-9) & np.isfinite(xyz).all(axis=1)
+    return Points(ids[good], xyz[good], covariance[good])
+
+
+class Follower(Protocol):
+    """A running filter, one frame at a time."""
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the scene."""
+        ...
+
+    keyframes: int
+    restarts: int
+
+    def follow(self, frame: Frame, dt: float) -> Report:
+        """The pose of the next frame."""
+        ...
+
+    def points(self) -> Points | None:
+        """The points that the filter now stands on; None where they have not changed."""
+        ...
+
+
+class TrackPairs:
+    """`jaxtri.tracker`: a base pair per track."""
+
+    def __init__(self, settings: Settings, state: tracker.State, last: Frame, common: np.ndarray) -> None:
+        self.settings, self.state = settings, state
+        self.keyframes, self.restarts = 2, 0
+        self._known = np.where(common, last.ids, -1)
+        self._new = True
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the scene."""
+        return float(self.state.depth)
+
+    def follow(self, frame: Frame, dt: float) -> Report:
+        """The pose of the next frame."""
+        fresh = frame.fresh | (frame.visible & (frame.ids != self._known))
+        self._known = np.where(frame.visible, frame.ids, -1)
+        self.state, report = _step(
+            self.settings,
+            self.state,
+            jnp.asarray(frame.u),
+            jnp.asarray(frame.visible),
+            jnp.asarray(fresh),
+            dt,
+            hold=jnp.asarray(False),
+        )
+        if bool(report.keyframe):
+            self.keyframes += 1
+            self._new = True
+        return report
+
+    def points(self) -> Points | None:
+        """The points of all usable tracks, after a keyframe."""
+        if not self._new:
+            return None
+        self._new = False
+        tracks = self.state.tracks
+        return _points(tracks.base, np.asarray(tracks.usable), self._known, self.settings)
+
+
+class SinglePair:
+    """`jaxtri.segments`: one base pair for all tracks, restarted as its tracks run out."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        start: StartSettings,
+        base: Base,
+        frames: list[Frame],
+        two_view: TwoView,
+        world: SE3,
+    ) -> None:
+        self.settings, self.start, self.base = settings, start, base
+        self.keyframes, self.restarts = 2, 0
+        placement = segments.origin(settings.sigma.dtype)._replace(pose=world)
+        self._history: deque[tuple[Frame, SE3, Array]] = deque(maxlen=40)
+        self._history.append((frames[0], world, jnp.zeros((6, 6), settings.sigma.dtype)))
+        self._begin(frames[0], frames[-1], two_view, placement)
+
+    @property
+    def depth(self) -> float:
+        """Median depth of the scene at the start of the segment."""
+        return float(self.state.depth)
+
+    def _begin(self, first: Frame, second: Frame, two_view: TwoView, placement: segments.Placement) -> None:
+        mask = first.common(second)
+        self.state = _segment_init(
+            self.settings,
+            jnp.asarray(first.u),
+            jnp.asarray(second.u),
+            jnp.asarray(mask),
+            two_view,
+            placement,
+            float(second.index - first.index),
+        )
+        self._ids = np.where(mask, second.ids, -1)
+        self._size = int(np.asarray(self.state.inside).sum())
+        self._new = True
+
+    def follow(self, frame: Frame, dt: float) -> Report:
+        """The pose of the next frame, after a restart where the tracks of the pair have run out."""
+        left = np.asarray(self.state.inside) & frame.visible & (frame.ids == self._ids)
+        short = left.sum() < max(self.start.restart * self._size, 2 * float(self.settings.minimum))
+        if short and self.base is Base.PAPER:
+            report = self._consecutive(frame, dt)
+            if report is not None:
+                return report
+        report = self._advance(frame, dt)
+        if short and self.base is Base.INHERIT and int(report.status) == Status.TRACKING:
+            self._inherit()
+        return report
+
+    def _advance(self, frame: Frame, dt: float) -> Report:
+        fresh = frame.fresh | (frame.ids != self._ids)
+        arrays = jnp.asarray(frame.u), jnp.asarray(frame.visible), jnp.asarray(fresh)
+        self.state, report = _segment_step(self.settings, self.state, *arrays, dt)
+        self._history.append((frame, report.pose, report.covariance))
+        return report
+
+    def _consecutive(self, frame: Frame, dt: float) -> Report | None:
+        """The paper's restart: two consecutive frames, `overlap` frames back, the scale from common points."""
+        known = [*self._history][-self.start.overlap :]
+        first, pose1, covariance1 = known[0]
+        frames = [k[0] for k in known[1:]] + [frame]
+        second = frames[0]
+        found = find(self.settings, self.start, [first, second]).pose
+        if found is None:
+            return None  # go on with the old pair as long as it lasts
+        relative = pose1 @ self.state.placement.pose.inverse()
+        before, before_sd = _depths(self.state, relative)
+        both = np.asarray(self.state.inside) & first.common(second) & (first.ids == self._ids)
+        one = _pair_depths(found, jnp.asarray(first.u), jnp.asarray(second.u))
+        scale, variance = _common_scale(before, before_sd, *one, jnp.asarray(both), self.settings.sigma)
+        if both.sum() < 3:
+            return None
+        old = self.state.placement.covariance
+        placement = segments.Placement(pose1, segments.place(covariance1, old[6, 6] + variance))
+        self._begin(first, second, scaled(found, scale), placement)
+        self.restarts += 1
+        self.keyframes += 2
+        report = _segment_report(self.state)
+        self._history = deque(known[:1], maxlen=40)
+        self._history.append((second, report.pose, report.covariance))
+        for later in frames[1:]:
+            report = self._advance(later, dt)
+        return report
+
+    def _inherit(self) -> None:
+        """A new pair from two frames already tracked: the present one and the best of those before it."""
+        *earlier, (now, pose, _) = self._history
+        best, choice = 0.0, None
+        for frame, other, _ in earlier:
+            common = frame.common(now)
+            if common.sum() < self.start.points:
+                continue
+            relative = np.asarray((pose @ other.inverse()).as_matrix())
+            angle = _parallax(frame.u[common], now.u[common], relative[:3, :3])
+            # Information on depth: the angle, up to where more of it no longer helps, by the root of the count.
+            score = min(angle, 3 * float(self.settings.fixed_parallax)) * np.sqrt(common.sum())
+            if score > best:
+                best, choice = score, (frame, other)
+        if choice is None:
+            return
+        frame, other = choice
+        index = [h[0].index for h in self._history].index(frame.index)
+        earlier_covariance = self._history[index][2]
+        relative = pose @ other.inverse()
+        own = segments.own_covariance(self.state)
+        T = relative.translation()
+        refined = _refine(
+            T,
+            relative.rotation(),
+            jnp.asarray(frame.u),
+            jnp.asarray(now.u),
+            jnp.asarray(frame.common(now)),
+            self.settings.sigma,
+            prior=segments.additive(own + 1e-12 * jnp.eye(6, dtype=own.dtype), T),
+        )
+        if not bool(refined.converged):
+            return
+        direction = T / jnp.linalg.norm(T)
+        length_variance = direction @ own[:3, :3] @ direction / (T @ T)
+        old = self.state.placement.covariance
+        placement = segments.Placement(other, segments.place(earlier_covariance, old[6, 6] + length_variance))
+        self._begin(frame, now, refined, placement)
+        self.restarts += 1
+        self.keyframes += 1
+
+    def points(self) -> Points | None:
+        """The points of the pair, at the start of a segment."""
+        if not self._new:
+            return None
+        self._new = False
+        mean, one = self.state.belief.mean, self.state.placement.pose
+        two = compose(mean.base_rotation, mean.base_translation) @ one
+        base = _pairs(self.state.pairs, one, two)
+        return _points(base, np.asarray(self.state.inside), self._ids, self.settings)
+
+
+@jax.jit
+def _segment_report(state: segments.State) -> Report:
+    """What a new segment says of its second base frame, which no update has measured."""
+    inside = state.inside
+    nothing = jnp.zeros(inside.shape, state.pairs.dtype)
+    unknown = jnp.full((), jnp.nan, state.pairs.dtype)
+    diagnostics = Diagnostics(unknown, unknown, jnp.sum(inside), inside.astype(nothing.dtype), nothing)
+    pose, covariance = segments.world_pose(state)
+    return Report(
+        pose,
+        covariance,
+        jnp.asarray(int(Status.TRACKING)),
+        jnp.asarray(True),
+        jnp.zeros_like(inside),
+        diagnostics,
+    )
+
+
+@jax.jit
+def _pairs(pairs: jax.Array, one: SE3, two: SE3) -> BasePoint:
+    return jax.vmap(lambda p: base_point(p[:2], p[2:], one, two))(pairs)
+
+
+@jax.jit
+def _pair_depths(
+    two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Depths in the first view, and the standard deviation of their logarithms in units of sigma."""
+    R, T = two_view.rotation.as_matrix(), two_view.translation
+
+    def one(a: Array, b: Array) -> tuple[Array, Array]:
+        value, (da, db) = jax.value_and_grad(inverse_depth, argnums=(0, 1))(a, b, R, T, T)
+        safe = jnp.where(value > 1e-9, value, 1e-9)
+        return jnp.where(value > 1e-9, 1 / safe, 0.0), jnp.sqrt(jnp.sum(da**2) + jnp.sum(db**2)) / safe
+
+    return jax.vmap(one)(first, second)
+
+
+def _parallax(a: np.ndarray, b: np.ndarray, R: np.ndarray) -> float:
+    x = np.c_[a, np.ones(len(a))] @ R.T
+    y = np.c_[b, np.ones(len(b))]
+    return float(np.median(np.arctan2(np.linalg.norm(np.cross(x, y), axis=1), (x * y).sum(axis=1))))
+
+
+def scaled(two_view: TwoView, length: Float[Array, ""] | float) -> TwoView:
+    """The same relative pose with its translation multiplied by `length`."""
+    C = two_view.covariance
+    s = jnp.concatenate([jnp.full(3, length, C.dtype), jnp.ones(3, C.dtype)])
+    return two_view.__class__(
+        two_view.translation * length,
+        two_view.rotation,
+        C * jnp.outer(s, s),
+        two_view.rms,
+        two_view.converged,
+    )

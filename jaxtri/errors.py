@@ -1,0 +1,37 @@
+"""What can go wrong at the host boundary, as types; each message says what is wrong and what to try."""
+
+
+class JaxtriError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class InputError(JaxtriError, ValueError):
+    """An argument, array or file that cannot be used as given."""
+
+
+class CameraError(InputError):
+    """Intrinsics that are missing, not finite, negative or of an unknown model."""
+
+
+class VideoError(InputError):
+    """A source of frames that cannot be opened or read."""
+
+
+class ResolutionChangeError(VideoError):
+    """The frame size changed midway through a source."""
+
+
+class TruncatedVideoError(VideoError):
+    """Fewer frames could be decoded than the source declares (raised with `strict` only)."""
+
+
+class TruncatedVideoWarning(UserWarning):
+    """Fewer frames could be decoded than the source declares."""
+
+
+class TrajectoryError(InputError):
+    """A trajectory file that cannot be parsed, or trajectories that cannot be compared."""
+
+
+class InitialisationError(JaxtriError):
+    """No camera motion could be recovered from the whole sequence."""

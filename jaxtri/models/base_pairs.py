@@ -1,0 +1,72 @@
+"""The trifocal transfer with a base pair per track: every point has its own two base frames, already known.
+
+With the base poses fixed, the point that the pair fixes is constant, and the transfer to the current frame
+is the projection of that homogeneous point; what it owes to the noise of the two base observations is
+carried along as `spread`. The items are these pairs, so a frame costs O(N) with 12 error components.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Float
+
+from jaxtri.geometry.pose import local, retract
+from jaxtri.geometry.trifocal import point_from_bases, project
+from jaxtri.models.motion import Twist, twist_noise
+
+
+class BasePoint(NamedTuple):
+    """A homogeneous world point fixed by a base pair, and its derivative with respect to the two observations."""
+
+    point: Float[Array, "4"]
+    spread: Float[Array, "4 4"]
+
+
+def base_point(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, pose2: SE3) -> BasePoint:
+    """The point seen at `first` from `pose1` and at `second` from `pose2` (world to camera)."""
+
+    def point(pair: Array) -> Array:
+        R1, R2 = pose1.rotation().as_matrix(), pose2.rotation().as_matrix()
+        return point_from_bases(pair[:2], pair[2:], R1, pose1.translation(), R2, pose2.translation())
+
+    pair = jnp.concatenate([first, second])
+    return BasePoint(point(pair), jax.jacfwd(point)(pair))
+
+
+class BasePairs(eqx.Module):
+    """Model of `jaxtri.ekf` for a camera on SE(3) whose items are `BasePoint`s; every field is a leaf."""
+
+    sigma: Float[Array, ""]  # noise of an image point, normalised image units
+    acceleration: Float[Array, ""]  # scene units per frame^2, in camera axes
+    angular_acceleration: Float[Array, ""]  # radians per frame^2
+
+    def retract(self, mean: Twist, delta: Float[Array, "12"]) -> Twist:
+        """The state moved by an error."""
+        return retract(mean, delta)
+
+    def local(self, mean: Twist, other: Twist) -> Float[Array, "12"]:
+        """The error that takes `mean` to `other`."""
+        return local(mean, other)
+
+    def predict(self, mean: Twist, dt: Float[Array, ""]) -> Twist:
+        """Constant velocity in camera axes."""
+        return mean.advance(dt)
+
+    def process_noise(self, mean: Twist, dt: Float[Array, ""]) -> Float[Array, "12 12"]:
+        """White acceleration."""
+        return twist_noise(self.acceleration, self.angular_acceleration, dt)
+
+    def _project(self, mean: Twist, X: Float[Array, "4"]) -> Float[Array, "2"]:
+        return project(X, mean.pose.rotation().as_matrix(), mean.pose.translation())
+
+    def measure(self, mean: Twist, item: BasePoint) -> Float[Array, "2"]:
+        """The transferred point, normalised."""
+        return self._project(mean, item.point)
+
+    def noise(self, mean: Twist, item: BasePoint) -> Float[Array, "2 2"]:
+        """sigma^2 (I + J J'), J the derivative of the transfer with respect to the two base observations."""
+        J = jax.jacfwd(lambda X: self._project(mean, X))(item.point) @ item.spread
+        return jnp.square(self.sigma) * (jnp.eye(2, dtype=J.dtype) + J @ J.T)

@@ -1,0 +1,145 @@
+"""The paper's filter: the pose of a camera, measured by the trifocal transfer from two base frames.
+
+The structure of the scene is not in the state: a frame costs O(N). One code path serves three modes that
+differ in what they hold, not in what they do: `default` (SO(3), base noise in R, several passes), `paper`
+(yaw-pitch-roll, constant R, one pass) and, later, a consistent one.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxlie import SO3
+from jaxtyping import Array, Bool, Float
+
+from jaxtri.ekf import Belief
+from jaxtri.geometry.epipolar import inverse_depth, safe_norm
+from jaxtri.geometry.pose import euler_from_matrix, local, retract, rotation_matrix
+from jaxtri.geometry.trifocal import transfer
+from jaxtri.models.motion import Kinematics, acceleration_noise
+from jaxtri.two_view import TwoView
+
+
+class TrifocalState(eqx.Module):
+    """Pose and velocity of the current frame and pose of the second base frame: 18 error components.
+
+    The world is the camera of the first base frame. Source: Yu et al. 2006, section IV.
+    """
+
+    motion: Kinematics
+    base_translation: Float[Array, "3"]
+    base_rotation: SO3 | Float[Array, "3"]
+
+
+class Trifocal(eqx.Module):
+    """Model of `jaxtri.ekf` whose items are point pairs (u, u') of the two base frames, in one array of 4.
+
+    Every field is a leaf and may be tuned; lengths are normalised image units (pixels over focal length) and
+    units of the scene, per frame.
+    """
+
+    sigma: Float[Array, ""]  # noise of an image point, in all three views
+    acceleration: Float[Array, ""]  # scene units per frame^2
+    angular_acceleration: Float[Array, ""]  # radians per frame^2
+    base_drift: Float[Array, ""]  # of the second base pose, per frame
+    epipole: Float[Array, "3"]  # of the second base frame, homogeneous, as known at the start
+    base_noise: bool = eqx.field(static=True, default=True)
+
+    def retract(self, mean: TrifocalState, delta: Float[Array, "18"]) -> TrifocalState:
+        """The state moved by an error; the length of the base line is the gauge and stays."""
+        moved = retract(mean, delta)
+        norm = safe_norm(mean.base_translation)
+        pinned = moved.base_translation * (norm / safe_norm(moved.base_translation))
+        return TrifocalState(moved.motion, pinned, moved.base_rotation)
+
+    def local(self, mean: TrifocalState, other: TrifocalState) -> Float[Array, "18"]:
+        """The error that takes `mean` to `other`."""
+        return local(mean, other)
+
+    def predict(self, mean: TrifocalState, dt: Float[Array, ""]) -> TrifocalState:
+        """Constant velocity; the base frame stays. Source: Yu et al. 2006, eqs 5 and 10."""
+        return TrifocalState(mean.motion.advance(dt), mean.base_translation, mean.base_rotation)
+
+    def process_noise(self, mean: TrifocalState, dt: Float[Array, ""]) -> Float[Array, "18 18"]:
+        """White acceleration, and a drift of the second base pose that leaves the scale alone."""
+        n = mean.base_translation / safe_norm(mean.base_translation)
+        eye = jnp.eye(3, dtype=n.dtype)
+        drift = jnp.square(self.base_drift) * dt
+        length = safe_norm(mean.base_translation) ** 2
+        motion = acceleration_noise(self.acceleration, self.angular_acceleration, dt)
+        return jax.scipy.linalg.block_diag(motion, drift * length * (eye - jnp.outer(n, n)), drift * eye)
+
+    def _transfer(self, mean: TrifocalState, pair: Float[Array, "4"]) -> Float[Array, "2"]:
+        R2, T2 = rotation_matrix(mean.base_rotation), mean.base_translation
+        return transfer(pair[:2], pair[2:], R2, T2, mean.motion.R, mean.motion.translation, self.epipole)
+
+    def measure(self, mean: TrifocalState, item: Float[Array, "4"]) -> Float[Array, "2"]:
+        """The transferred point, normalised. Source: Yu et al. 2006, eqs 6-9."""
+        return self._transfer(mean, item)
+
+    def noise(self, mean: TrifocalState, item: Float[Array, "4"]) -> Float[Array, "2 2"]:
+        """sigma^2 (I + J J'), J the derivative of the transfer with respect to the two base points.
+
+        With `base_noise` off the constant sigma^2 I of the paper.
+        """
+        noise = jnp.eye(2, dtype=item.dtype)
+        if self.base_noise:
+            J = jax.jacfwd(lambda pair: self._transfer(mean, pair))(item)
+            noise = noise + J @ J.T
+        return jnp.square(self.sigma) * noise
+
+
+def start(
+    two_view: TwoView,
+    *,
+    frames: Float[Array, ""] | float = 1.0,
+    velocity_sd: Float[Array, ""] | float,
+    angular_velocity_sd: Float[Array, ""] | float,
+    euler: bool = False,
+) -> Belief[TrifocalState]:
+    """The belief at the second base frame, `frames` after the first, from a two-view estimate.
+
+    The current pose and the base pose are one pose at that moment: its covariance enters both blocks fully
+    correlated. The velocity is that between the two frames, with the given standard deviations (scene
+    units and radians per frame). With `euler` rotations are the paper's yaw, pitch and roll.
+    """
+    T, R, C = two_view.translation, two_view.rotation, two_view.covariance
+    dtype = T.dtype
+    angles = euler_from_matrix(R.as_matrix())
+    rotation, rate = (angles, angles / frames) if euler else (R, R.log() / frames)
+    state = TrifocalState(Kinematics(T, T / frames, rotation, rate), T, rotation)
+    if euler:
+        # From the error in camera axes to one of the angles.
+        J = jax.jacfwd(lambda d: euler_from_matrix((SO3.exp(d) @ R).as_matrix()))(jnp.zeros(3, dtype))
+        C = jax.scipy.linalg.block_diag(jnp.eye(3, dtype=dtype), J) @ C
+        C = C @ jax.scipy.linalg.block_diag(jnp.eye(3, dtype=dtype), J).T
+    # Rows of the 18 errors that are the translation and rotation of the pose, in both places.
+    E = jnp.zeros((18, 6), dtype).at[jnp.array([0, 1, 2, 6, 7, 8]), jnp.arange(6)].set(1)
+    E = E.at[jnp.arange(12, 18), jnp.arange(6)].set(1)
+    E = E.at[jnp.array([3, 4, 5, 9, 10, 11]), jnp.arange(6)].set(1 / frames)
+    variance = (
+        jnp.zeros(18, dtype)
+        .at[3:6]
+        .set(jnp.square(velocity_sd))
+        .at[9:12]
+        .set(jnp.square(angular_velocity_sd))
+    )
+    return Belief(state, E @ C @ E.T + jnp.diag(variance))
+
+
+def informative(
+    state: TrifocalState, pairs: Float[Array, "n 4"], sigma: Float[Array, ""], smallest_snr: float = 0.0
+) -> Bool[Array, " n"]:
+    """Pairs whose depth the base line fixes: in front of the camera, and `smallest_snr` times above its noise.
+
+    A point near the epipole of the second frame has no depth, wherever it is.
+    """
+    R2, T2 = rotation_matrix(state.base_rotation), state.base_translation
+
+    def signal(pair: Float[Array, "4"]) -> tuple[Array, Array]:
+        def depth(p: Array) -> Array:
+            return inverse_depth(p[:2], p[2:], R2, T2, T2)
+
+        return depth(pair), safe_norm(jax.grad(depth)(pair)) * sigma
+
+    value, sd = jax.vmap(signal)(pairs)
+    return (value > 0) & (value > smallest_snr * sd)

@@ -1,0 +1,279 @@
+"""A camera's trajectory from feature tracks, on the host: waiting for parallax, starting, following, restarting.
+
+The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, and needs a decision, is here.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxlie import SE3
+
+from jaxtri.bases import (
+    Base,
+    Follower,
+    Frame,
+    Points,
+    SinglePair,
+    StartSettings,
+    TrackPairs,
+    fill,
+    find,
+    hold,
+    scaled,
+)
+from jaxtri.errors import InitialisationError, InputError
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.pose import compose
+from jaxtri.tracker import Report, Settings, Status
+from jaxtri.trajectory import Trajectory
+from jaxtri.two_view import TwoView
+from jaxtri.vision.klt import FrameTracks
+
+
+@dataclass
+class FramePose:
+    """One frame of the result.
+
+    `T_camera_world` (4, 4) and `covariance` (6, 6) of its error exp(xi) T, (linear, angular) in camera axes;
+    both None where there is no pose. `used` points agreed; `nis` is their normalised innovation squared.
+    """
+
+    time: float
+    status: Status
+    T_camera_world: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    used: int = 0
+    nis: float = float("nan")
+
+
+_normalise = eqx.filter_jit(lambda camera, pixels: camera.to_normalised(pixels))
+
+
+@dataclass
+class Odometry:
+    """Feeds feature tracks, frame by frame, to the recursive filters and collects what they say.
+
+    `add` takes the frames in order and returns the tracks to give up. While the camera has not moved enough
+    the frames wait with the status INITIALISING; they are filled in when the first base pair stands. After a
+    complete loss a new start follows, whose scale is unknown: it is set so that the scene is as deep as it
+    was, and `scale_unknown_from` names the frame from which this is a guess.
+    """
+
+    camera: Camera
+    settings: Settings | None = None
+    base: Base = Base.TRACKS
+    start: StartSettings | None = None
+    frame_time: float | None = None  # seconds of one frame; the first interval by default
+
+    poses: list[FramePose] = field(default_factory=list, init=False)
+    base_pair: tuple[int, int] | None = field(default=None, init=False)  # frames of the first start
+    segments: int = field(default=0, init=False)  # starts: more than one means that the camera was lost
+    scale_unknown_from: int | None = field(default=None, init=False)
+    reason: str = field(default="no frames yet", init=False)  # why there is no start yet
+
+    def __post_init__(self) -> None:
+        if self.camera.width is None:
+            raise InputError(
+                "the camera has no image width: set it, the thresholds of the tracker scale with it"
+            )
+        self._settings = self.settings or Settings.of(self.camera)
+        self._start = self.start or StartSettings.of(self.base)
+        self._waiting: list[Frame] = []  # frames that may still become a base pair
+        self._passed: list[Frame] = []  # frames that no longer can
+        self._follower: Follower | None = None
+        self._points: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._tried = (-1, 0.0)
+        self._depth = 1.0
+        self._changes = 0
+
+    def add(self, tracks: FrameTracks, time: float) -> np.ndarray:
+        """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
+
+        `tracks` hold pixels in slots; entries that are not visible, or not finite, count nothing. Raises
+        `InputError` where the time does not increase.
+        """
+        index = len(self.poses)
+        if self.poses and not time > self.poses[-1].time:
+            raise InputError(f"frame {index}: its time {time} does not follow {self.poses[-1].time}")
+        if self.frame_time is None and self.poses:
+            self.frame_time = time - self.poses[-1].time
+        frame = self._frame(index, tracks, time)
+        self.poses.append(FramePose(time, Status.LOST if self.segments else Status.INITIALISING))
+        if self._follower is None:
+            self._waiting.append(frame)
+            self._try_start()
+            return np.zeros(len(frame.visible), bool)
+        report = self._follower.follow(frame, self._dt(index))
+        self._record(frame, report.pose, report)
+        if self.poses[-1].status is Status.LOST:
+            self._lose(frame)
+        else:
+            self._collect()
+        return np.asarray(report.drop)
+
+    @property
+    def status(self) -> Status:
+        """Status of the newest frame."""
+        return self.poses[-1].status if self.poses else Status.INITIALISING
+
+    @property
+    def keyframes(self) -> int:
+        """Base frames kept since the last start."""
+        return 0 if self._follower is None else self._follower.keyframes
+
+    @property
+    def changes(self) -> int:
+        """How often the single pair was replaced (inherit, paper)."""
+        return self._changes + (0 if self._follower is None else self._follower.restarts)
+
+    def trajectory(self) -> Trajectory:
+        """The trajectory so far, camera to world; a frame without a pose repeats its neighbour's, by its status.
+
+        Raises `InitialisationError`, with the reason, where no frame has a pose.
+        """
+        known = [i for i, p in enumerate(self.poses) if p.T_camera_world is not None]
+        if not known:
+            raise InitialisationError(
+                f"no camera motion was found in {len(self.poses)} frames: {self.reason}. A camera that stands still "
+                "or only turns shows no parallax: give a longer sequence with sideways motion, or ask for less "
+                "parallax"
+            )
+        nearest = [known[int(np.argmin(np.abs(np.array(known) - i)))] for i in range(len(self.poses))]
+        T = np.stack([self.poses[i].T_camera_world for i in nearest])  # pyright: ignore[reportArgumentType, reportCallIssue]
+        C = np.stack([self.poses[i].covariance for i in nearest])  # pyright: ignore[reportArgumentType, reportCallIssue]
+        R = np.swapaxes(T[:, :3, :3], 1, 2)
+        world = np.tile(np.eye(4), (len(T), 1, 1))
+        world[:, :3, :3] = R
+        world[:, :3, 3] = -np.einsum("tij,tj->ti", R, T[:, :3, 3])
+        # exp(xi) T_camera_world moves the centre by -R' rho and turns R_world_camera by exp(-theta) on the right.
+        J = np.zeros((len(T), 6, 6))
+        J[:, :3, :3] = -R
+        J[:, 3:, 3:] = -np.eye(3)
+        times = np.array([p.time for p in self.poses])
+        status = np.array([int(p.status) for p in self.poses])
+        return Trajectory(times, world, J @ C @ np.swapaxes(J, 1, 2), status)
+
+    def points(self) -> Points:
+        """The points triangulated so far, in the world frame."""
+        if not self._points:
+            return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        ids = np.array(sorted(self._points))
+        xyz, covariance = (np.stack([self._points[i][k] for i in ids]) for k in (0, 1))
+        return Points(ids, xyz, covariance)
+
+    def _frame(self, index: int, tracks: FrameTracks, time: float) -> Frame:
+        visible = np.asarray(tracks.visible, bool) & np.isfinite(tracks.pixels).all(axis=1)
+        pixels = jnp.asarray(np.where(visible[:, None], tracks.pixels, 0.0), self._settings.sigma.dtype)
+        u = np.asarray(_normalise(self.camera, pixels))
+        visible &= np.isfinite(u).all(axis=1)
+        return Frame(index, time, u, visible, np.asarray(tracks.fresh, bool) & visible, np.array(tracks.ids))
+
+    def _dt(self, index: int) -> float:
+        if index == 0 or not self.frame_time:
+            return 1.0
+        return (self.poses[index].time - self.poses[index - 1].time) / self.frame_time
+
+    def _record(self, frame: Frame, pose: SE3, report: Report | None, status: Status | None = None) -> None:
+        entry = self.poses[frame.index]
+        entry.T_camera_world = np.asarray(pose.as_matrix(), np.float64)
+        entry.covariance = np.zeros((6, 6)) if report is None else np.asarray(report.covariance, np.float64)
+        if report is not None:
+            entry.status = Status(int(report.status))
+            entry.used, entry.nis = int(report.diagnostics.used), float(report.diagnostics.nis)
+        if status is not None:
+            entry.status = status
+
+    def _collect(self) -> None:
+        assert self._follower is not None
+        points = self._follower.points()
+        if points is not None:
+            self._depth = self._follower.depth
+            self._points |= {int(i): (x, c) for i, x, c in zip(*points, strict=True)}
+
+    # -- starting ---------------------------------------------------------------------------------------------
+
+    def _try_start(self) -> None:
+        """Look for a base pair between the first waiting frame and the newest."""
+        now = self._waiting[-1]
+        while len(self._waiting) > 1:
+            first = self._waiting[0]
+            common = first.common(now)
+            if common.sum() >= max(self._start.points, self._start.common * first.visible.sum()):
+                break
+            # Too little is left of the first frame: wait from a later one.
+            self._passed.append(self._waiting.pop(0))
+        if len(self._waiting) < 2:
+            self.reason = f"only {int(now.visible.sum())} features in frame {now.index}, and fewer last"
+            return
+        first, common = self._waiting[0], self._waiting[0].common(now)
+        width = (self.camera.width or 0) / float(jnp.sqrt(self.camera.fx * self.camera.fy))
+        flow = float(np.median(np.linalg.norm(now.u[common] - first.u[common], axis=1))) / width
+        if flow < self._start.flow:
+            self.reason = f"the median flow is {flow:.1%} of the image width, {self._start.flow:.1%} needed"
+            return
+        tried, before = self._tried
+        if tried == first.index and flow < 1.1 * before:
+            return
+        self._tried = (first.index, flow)
+        found = find(self._settings, self._start, self._waiting)
+        self.reason = found.reason
+        if found.pose is not None:
+            self._begin(self._waiting, found.pose)
+
+    def _begin(self, frames: list[Frame], pose: TwoView) -> None:
+        """Set up the filter from a base pair, and fill in the frames between and before."""
+        first, last = frames[0], frames[-1]
+        again = self.segments > 0
+        world = jax.tree.map(lambda x: x.astype(pose.translation.dtype), SE3.identity())
+        if again:
+            held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
+            world = SE3.from_matrix(jnp.asarray(held, pose.translation.dtype))
+            state, _ = fill(
+                self._settings,
+                frames[:1] + frames[-1:],
+                compose(pose.rotation, pose.translation),
+                world,
+                [1.0],
+            )
+            pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
+            self.scale_unknown_from = self.scale_unknown_from or first.index
+        else:
+            self.base_pair = (first.index, last.index)
+        relative = compose(pose.rotation, pose.translation)
+        state, reports = fill(
+            self._settings, frames, relative, world, [self._dt(f.index) for f in frames[1:]]
+        )
+        self._record(first, world, None, Status.RESTARTED if again else Status.TRACKING)
+        for frame, report in [*reports, *self._backwards(first, state, world)]:
+            self._record(frame, report.pose, report)
+        if self.base is Base.TRACKS:
+            self._follower = TrackPairs(self._settings, state, last, first.common(last))
+        else:
+            self._follower = SinglePair(self._settings, self._start, self.base, frames, pose, world)
+        self.segments += 1
+        self._waiting, self._passed = [], []
+        self._collect()
+
+    def _backwards(self, first: Frame, state, world: SE3) -> Iterator[tuple[Frame, Report]]:
+        """Frames that waited before the first base frame, newest first, as far as its tracks reach."""
+        mean = eqx.tree_at(
+            lambda m: (m.pose, m.twist), state.belief.mean, (world, jnp.zeros_like(state.belief.mean.twist))
+        )
+        state = state._replace(belief=eqx.tree_at(lambda b: b.mean, state.belief, mean))
+        for frame in reversed(self._passed):
+            state, report = hold(self._settings, state, frame, first.common(frame), 1.0)
+            if int(report.status) != Status.TRACKING:
+                return
+            yield frame, report
+
+    def _lose(self, frame: Frame) -> None:
+        """The camera is lost: start again from here."""
+        assert self._follower is not None
+        self._changes += self._follower.restarts
+        self._follower = None
+        self._waiting, self._tried = [frame], (-1, 0.0)
+        self.reason = "too few points agreed with any motion"

@@ -1,0 +1,148 @@
+"""From frames to a trajectory: feature tracking, the recursive filter, and what is worth keeping of both."""
+
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxtri.bases import Base, Points, StartSettings
+from jaxtri.errors import CameraError, InputError
+from jaxtri.geometry.camera import Camera
+from jaxtri.odometry import Odometry
+from jaxtri.tracker import Settings, Status
+from jaxtri.trajectory import Trajectory
+from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
+from jaxtri.vision.video import Frame, FrameSource
+
+
+@dataclass
+class Run:
+    """What a sequence gave: the camera's trajectory, the points it was measured from, and figures of the run."""
+
+    trajectory: Trajectory
+    points: Points
+    colours: np.ndarray  # (n, 3) uint8 RGB of the points
+    odometry: Odometry
+    statistics: dict[str, object] = field(default_factory=dict)
+
+
+def track(
+    source: Iterable[Frame],
+    camera: Camera,
+    *,
+    base: Base = Base.TRACKS,
+    settings: Settings | None = None,
+    start: StartSettings | None = None,
+    klt: KLTSettings | None = None,
+    progress: bool = True,
+    max_frames: int | None = None,
+) -> Run:
+    """Recover the camera's trajectory from the frames of a source, one pass, in order.
+
+    An interrupt (Ctrl-C) ends the sequence there; what was tracked so far is kept. Raises
+    `InitialisationError` where the camera never moved enough, `CameraError` where the frames are not of the
+    size the camera was calibrated for, `InputError` on fewer than two frames, and what the source raises.
+    """
+    follower, tracker = KLT(klt or KLTSettings()), Odometry(camera, settings, base, start)
+    colours: dict[int, np.ndarray] = {}
+    seconds = {"decoding": 0.0, "optical flow": 0.0, "filter": 0.0}
+    declared = source.declared if isinstance(source, FrameSource) else None
+    bar = tqdm(total=declared, unit="frame", disable=None if progress else True, leave=False)
+    interrupted = False
+    began = clock = time.perf_counter()
+    try:
+        for frame in source:
+            seconds["decoding"] += time.perf_counter() - clock
+            _same_size(camera, frame)
+            clock = time.perf_counter()
+            tracks = follower.track(frame.image)
+            _sample(colours, tracks, frame.image)
+            seconds["optical flow"] += time.perf_counter() - clock
+            clock = time.perf_counter()
+            follower.drop(tracker.add(tracks, frame.time_s))
+            seconds["filter"] += time.perf_counter() - clock
+            bar.set_postfix_str(
+                f"{tracker.status.name.lower()}, {tracker.poses[-1].used} points", refresh=False
+            )
+            bar.update()
+            if max_frames is not None and len(tracker.poses) >= max_frames:
+                break
+            clock = time.perf_counter()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        bar.close()
+    if len(tracker.poses) < 2:
+        raise InputError(f"{len(tracker.poses)} frame: a camera's motion needs at least two")
+    trajectory, points = tracker.trajectory(), tracker.points()
+    grey = np.full(3, 128, np.uint8)
+    statistics = _statistics(tracker) | {
+        "frames_per_second": len(tracker.poses) / (time.perf_counter() - began),
+        "seconds": {k: round(v, 3) for k, v in seconds.items()},
+        "interrupted": interrupted,
+    }
+    rgb = np.array([colours.get(int(i), grey) for i in points.ids], np.uint8).reshape(-1, 3)
+    return Run(trajectory, points, rgb, tracker, statistics)
+
+
+def follow_tracks(
+    camera: Camera,
+    pixels: np.ndarray,
+    visible: np.ndarray,
+    times: np.ndarray | None = None,
+    *,
+    base: Base = Base.TRACKS,
+    settings: Settings | None = None,
+    start: StartSettings | None = None,
+) -> Odometry:
+    """The same from feature tracks: `pixels` (t, n, 2) and `visible` (t, n), a column a track.
+
+    NaN where a track is not seen is as good as False. `times` (t,) in seconds, by default the frame number.
+    """
+    if pixels.ndim != 3 or pixels.shape[2] != 2 or visible.shape != pixels.shape[:2]:
+        raise InputError(
+            f"tracks of shape {pixels.shape} with visible {visible.shape}: give (t, n, 2) and (t, n)"
+        )
+    times = np.arange(len(pixels), dtype=float) if times is None else times
+    odometry = Odometry(camera, settings, base, start)
+    ids, nothing = np.arange(pixels.shape[1]), np.zeros(pixels.shape[1])
+    before = np.zeros(pixels.shape[1], bool)
+    for t, (z, seen) in enumerate(zip(pixels, visible, strict=True)):
+        odometry.add(FrameTracks(z, seen, seen & ~before, ids, nothing), float(times[t]))
+        before = seen
+    return odometry
+
+
+def _same_size(camera: Camera, frame: Frame) -> None:
+    h, w = frame.image.shape[:2]
+    if camera.width is not None and camera.height is not None and (camera.width, camera.height) != (w, h):
+        raise CameraError(
+            f"the camera was calibrated at {camera.width}x{camera.height}, the frames are {w}x{h}: give the "
+            "calibration of this size, or resize the frames"
+        )
+
+
+def _sample(colours: dict[int, np.ndarray], tracks: FrameTracks, image: np.ndarray) -> None:
+    new = np.flatnonzero(tracks.fresh)
+    h, w = image.shape[:2]
+    x, y = tracks.pixels[new].round().astype(int).clip(0, [w - 1, h - 1]).T
+    colours |= dict(zip(tracks.ids[new].tolist(), image[y, x][:, ::-1], strict=True))
+
+
+def _statistics(odometry: Odometry) -> dict[str, object]:
+    status = Counter(p.status.name.lower() for p in odometry.poses)
+    used = [p.used for p in odometry.poses if p.status is Status.TRACKING]
+    return {
+        "frames": len(odometry.poses),
+        "status": dict(status),
+        "status_of_frame": [p.status.name.lower() for p in odometry.poses],
+        "segments": odometry.segments,
+        "restarts": odometry.changes,
+        "scale_unknown_from_frame": odometry.scale_unknown_from,
+        "base_pair": odometry.base_pair,
+        "keyframes": odometry.keyframes,
+        "points_used_per_frame": float(np.mean(used)) if used else 0.0,
+    }

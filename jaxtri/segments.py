@@ -1,0 +1,177 @@
+"""One base pair for all tracks, segment after segment: the paper's way, and the inherited pair.
+
+The filter of a segment is the 18-state one of `jaxtri.models.trifocal`, with the second base pose in the
+state. A segment stands in the world by the pose of its first base frame and the logarithm of its scale, both
+with their covariance. `init` and `step` are pure, on arrays of fixed capacity, like those of
+`jaxtri.tracker`; when to restart is the driver's business.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3, SO3
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtri import ekf
+from jaxtri.geometry.epipolar import inverse_depth, safe_norm
+from jaxtri.geometry.pose import adjoint, compose
+from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
+from jaxtri.tracker import Report, Settings, judge, median
+from jaxtri.two_view import TwoView
+
+
+class Placement(NamedTuple):
+    """Where a segment stands in the world."""
+
+    pose: SE3  # of its first base frame, world to camera
+    covariance: Float[Array, "7 7"]  # of (pose error in camera axes, logarithm of the scale)
+
+
+class State(NamedTuple):
+    """What is carried from frame to frame."""
+
+    belief: ekf.Belief[TrifocalState]
+    pairs: Float[Array, "n 4"]
+    inside: Bool[Array, " n"]  # tracks of the base pair, unbroken so far
+    placement: Placement
+    epipole: Float[Array, "3"]
+    depth: Float[Array, ""]
+    coasted: Int[Array, ""]
+
+
+def origin(dtype: jnp.dtype) -> Placement:
+    """The placement of the first segment: the world itself, its scale the gauge."""
+    identity = jax.tree.map(lambda x: x.astype(dtype), SE3.identity())
+    return Placement(identity, jnp.zeros((7, 7), dtype))
+
+
+def _model(settings: Settings, epipole: Float[Array, "3"], depth: Float[Array, ""]) -> Trifocal:
+    drift = jnp.zeros((), settings.sigma.dtype)
+    linear, angular = settings.acceleration * depth, settings.angular_acceleration
+    return Trifocal(settings.sigma, linear, angular, drift, epipole)
+
+
+def init(
+    settings: Settings,
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    two_view: TwoView,
+    placement: Placement,
+    frames: Float[Array, ""] | float = 1.0,
+) -> State:
+    """The state at the second base frame, `frames` after the first."""
+    pairs = jnp.concatenate([first, second], axis=-1)
+    pairs = jnp.where(mask[:, None], pairs, jnp.zeros((), pairs.dtype))
+    R, T = two_view.rotation.as_matrix(), two_view.translation
+    inverse = jax.vmap(lambda p: inverse_depth(p[:2], p[2:], R, T, T))(pairs)
+    depth = median(1 / jnp.where(inverse > 0, inverse, 1.0), mask & (inverse > 0))
+    belief = start(two_view, frames=frames, velocity_sd=0.05 * depth, angular_velocity_sd=0.05)
+    inside = mask & informative(belief.mean, pairs, settings.sigma, 2.0)
+    return State(belief, pairs, inside, placement, T, depth, jnp.asarray(0))
+
+
+def world_pose(state: State) -> tuple[SE3, Float[Array, "6 6"]]:
+    """Pose of the current frame, world to camera, and the covariance of its error (linear, angular)."""
+    motion = state.belief.mean.motion
+    assert isinstance(motion.rotation, SO3)
+    relative = compose(motion.rotation, motion.translation)
+    T = motion.translation
+    scale = jnp.concatenate([T, jnp.zeros_like(T)])[:, None]
+    G = jnp.concatenate([adjoint(relative), scale], axis=1)
+    return relative @ state.placement.pose, own_covariance(state) + G @ state.placement.covariance @ G.T
+
+
+def own_covariance(state: State) -> Float[Array, "6 6"]:
+    """Covariance of the current pose within its segment, as a left perturbation (linear, angular)."""
+    rows = jnp.array([0, 1, 2, 6, 7, 8])
+    J = _shear(state.belief.mean.motion.translation, 1.0)
+    return J @ state.belief.covariance[rows][:, rows] @ J.T
+
+
+def additive(covariance: Float[Array, "6 6"], T: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """The covariance of a left perturbation as one of errors (T, R): a sum in T, `exp(delta) R` in R."""
+    J = _shear(T, -1.0)
+    return J @ covariance @ J.T
+
+
+def _shear(T: Float[Array, "3"], sign: float) -> Float[Array, "6 6"]:
+    # exp(xi) of a pose also turns its T: rho = delta_T + T x theta.
+    eye, zero = jnp.eye(3, dtype=T.dtype), jnp.zeros((3, 3), T.dtype)
+    return jnp.block([[eye, sign * jnp.cross(T, eye).T], [zero, eye]])
+
+
+def place(pose: Float[Array, "6 6"], log_scale: Float[Array, ""]) -> Float[Array, "7 7"]:
+    """Covariance of a placement from that of its pose and the variance of its log scale."""
+    return jnp.zeros((7, 7), pose.dtype).at[:6, :6].set(pose).at[6, 6].set(log_scale)
+
+
+def step(
+    settings: Settings,
+    state: State,
+    observed: Float[Array, "n 2"],
+    visible: Bool[Array, " n"],
+    fresh: Bool[Array, " n"],
+    dt: Float[Array, ""] | float = 1.0,
+) -> tuple[State, Report]:
+    """One frame: predict, and update with the tracks of the base pair that are still there."""
+    inside = state.inside & visible & ~fresh
+    model = _model(settings, state.epipole, state.depth)
+    predicted = ekf.predict(model, state.belief, dt)
+    updated, diagnostics = ekf.update(
+        model, predicted, state.pairs, observed, inside, passes=settings.passes, robust=settings.robust
+    )
+    belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, inside, state.coasted)
+    drop = ok & inside & (diagnostics.distance > settings.outlier)
+    new = state._replace(belief=belief, inside=inside & ~drop, coasted=coasted)
+    pose, covariance = world_pose(new)
+    return new, Report(pose, covariance, status, jnp.asarray(False), drop, diagnostics)
+
+
+def depths(state: State, view: SE3) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Depth of every pair in a view, and the standard deviation of its logarithm in units of sigma.
+
+    `view` is its pose relative to the first base frame.
+    """
+    mean = state.belief.mean
+    assert isinstance(mean.base_rotation, SO3)
+    R2, T2 = mean.base_rotation.as_matrix(), mean.base_translation
+    R, T = view.rotation().as_matrix(), view.translation()
+
+    def one(pair: Float[Array, "4"]) -> tuple[Array, Array]:
+        def log_depth(p: Array) -> Array:
+            inverse = inverse_depth(p[:2], p[2:], R2, T2, T2)
+            inverse = jnp.where(inverse > 1e-9, inverse, 1e-9)
+            z = R[2] @ jnp.concatenate([p[:2], jnp.ones(1, p.dtype)]) / inverse + T[2]
+            return jnp.log(jnp.where(z > 1e-9, z, 1e-9))
+
+        value, slope = jax.value_and_grad(log_depth)(pair)
+        return jnp.exp(value), safe_norm(slope)
+
+    return jax.vmap(one)(state.pairs)
+
+
+def common_scale(
+    before: Float[Array, " n"],
+    before_sd: Float[Array, " n"],
+    after: Float[Array, " n"],
+    after_sd: Float[Array, " n"],
+    mask: Bool[Array, " n"],
+    sigma: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Scale that takes the new segment's depths to the old one's, and the variance of its logarithm.
+
+    Weighted median of the logarithms of the ratios; `sd` are those of the logarithms, in units of sigma.
+    """
+    good = mask & (before > 1e-6) & (after > 1e-6)
+    ratio = jnp.where(good, jnp.log(jnp.where(good, before, 1.0)) - jnp.log(jnp.where(good, after, 1.0)), 0.0)
+    weight = jnp.where(good, 1 / (jnp.square(sigma) * (before_sd**2 + after_sd**2) + 1e-12), 0.0)
+    order = jnp.argsort(jnp.where(good, ratio, jnp.inf))
+    total = jnp.cumsum(weight[order])
+    middle = jnp.argmax(total >= total[-1] / 2)
+    scale = jnp.exp(ratio[order[middle]])
+    # pi/2: what a median loses against a mean on Gaussian noise. The spread found may exceed the one expected.
+    expected = 1 / jnp.maximum(total[-1], 1e-12)
+    spread = jnp.sum(weight * (ratio - jnp.log(scale)) ** 2) / jnp.maximum(jnp.sum(good), 1)
+    return scale, jnp.pi / 2 * expected * jnp.maximum(spread, 1.0)

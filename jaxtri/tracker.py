@@ -1,0 +1,316 @@
+"""The recursive tracker over feature tracks: a camera's pose, frame by frame, with a base pair per track.
+
+`init` and `step` are pure functions on arrays of fixed capacity: a changing set of features is a changing
+mask. A keyframe is a frame whose pose is kept. Each track draws its two base frames from the keyframes, so
+there is no hand-over between segments: overlapping tracks carry the scale.
+"""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtri import ekf
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
+from jaxtri.models.base_pairs import BasePairs, BasePoint, base_point
+from jaxtri.models.motion import Twist
+
+
+class Status(IntEnum):
+    """What a pose is worth."""
+
+    INITIALISING = 0  # no pose yet: not enough parallax so far
+    TRACKING = 1
+    COASTING = 2  # predicted only: too few points agreed
+    RESTARTED = 3  # the first frame of a new start; its scale is unknown unless said otherwise
+    LOST = 4  # no pose
+
+
+class Settings(eqx.Module):
+    """What a tracker run may tune; lengths in normalised image units, angles in radians, times in frames.
+
+    `Settings.of(camera)` fills them from pixels.
+    """
+
+    sigma: Float[Array, ""]  # noise of an image point
+    acceleration: Float[Array, ""]  # of the camera, in median scene depths per frame^2
+    angular_acceleration: Float[Array, ""]  # per frame^2
+    keyframe_flow: Float[Array, ""]  # median flow since the last keyframe that makes a new one
+    keyframe_common: Float[Array, ""]  # ... or fewer common tracks than this
+    keyframe_usable: Float[Array, ""]  # ... or a smaller share of usable ones than this
+    usable_parallax: Float[Array, ""]  # angle from which a base pair may measure
+    fixed_parallax: Float[Array, ""]  # angle from which a base pair stays
+    epipolar_gate: Float[Array, ""]  # largest Sampson distance of a base pair
+    outlier: Float[Array, ""]  # squared Mahalanobis distance above which a track is given up
+    minimum: Float[Array, ""]  # fewest agreeing points of a pose
+    patience: Float[Array, ""]  # frames of coasting after which the camera is lost
+    robust: ekf.Robust
+    passes: int = eqx.field(static=True, default=8)
+
+    @classmethod
+    def of(cls, camera: Camera, *, noise_px: float = 0.4, passes: int = 8) -> "Settings":
+        """The defaults, for a camera whose tracks have `noise_px` of noise in each coordinate."""
+        focal = jnp.sqrt(camera.fx * camera.fy)
+        width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
+
+        def number(x: float) -> Array:
+            return jnp.asarray(x, focal.dtype)
+
+        return cls(
+            sigma=noise_px / focal,
+            acceleration=number(0.02),
+            angular_acceleration=number(0.02),
+            keyframe_flow=0.035 * width / focal,
+            keyframe_common=number(20),
+            keyframe_usable=number(0.3),
+            usable_parallax=jnp.deg2rad(number(0.3)),
+            fixed_parallax=jnp.deg2rad(number(1.5)),
+            epipolar_gate=1.5 / focal,
+            outlier=number(30.0),
+            minimum=number(8),
+            patience=number(15),
+            robust=ekf.Robust(number(1e4), number(16.0), number(13.8)),
+            passes=passes,
+        )
+
+
+class Tracks(NamedTuple):
+    """What is known of the track in each slot."""
+
+    first: Float[Array, "n 2"]  # observation in its first base frame
+    keyframe: Int[Array, " n"]  # keyframe slot of the first base frame; -1: none yet
+    base: BasePoint  # (n, 4), (n, 4, 4)
+    usable: Bool[Array, " n"]  # `base` may measure
+    fixed: Bool[Array, " n"]  # `base` stays
+
+
+class State(NamedTuple):
+    """What is carried from frame to frame."""
+
+    belief: ekf.Belief[Twist]
+    tracks: Tracks
+    keyframes: SE3  # (k,) world to camera; the newest overwrites the oldest
+    made: Int[Array, ""]  # keyframes made so far
+    seen: Float[Array, "n 2"]  # observations of the last keyframe
+    held: Bool[Array, " n"]  # tracks unbroken since then
+    depth: Float[Array, ""]  # median depth of the scene
+    coasted: Int[Array, ""]  # frames since the last update
+
+
+class Report(NamedTuple):
+    """What a step says of its frame."""
+
+    pose: SE3  # world to camera
+    covariance: Float[Array, "6 6"]  # of its error exp(delta) T: (linear, angular) in camera axes
+    status: Int[Array, ""]
+    keyframe: Bool[Array, ""]
+    drop: Bool[Array, " n"]  # tracks that are outliers: their slots may be filled anew
+    diagnostics: ekf.Diagnostics
+
+
+def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
+    return BasePairs(settings.sigma, settings.acceleration * depth, settings.angular_acceleration)
+
+
+def init(
+    settings: Settings,
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    pose: SE3,
+    *,
+    world: SE3 | None = None,
+    keyframes: int = 32,
+) -> State:
+    """The state at the first of two base frames whose relative pose X2 = pose X1 is known.
+
+    `mask` marks the slots seen in both. `world` is the pose of the first frame (the identity by default).
+    The frames between the two, and the second, follow by `step` with `hold=True`.
+    """
+    dtype = first.dtype
+    one = SE3.identity() if world is None else world
+    one = jax.tree.map(lambda x: x.astype(dtype), one)
+    two = pose @ one
+    first = jnp.where(mask[:, None], first, jnp.zeros((), dtype))
+    second = jnp.where(mask[:, None], second, jnp.zeros((), dtype))
+    base, good, _ = jax.vmap(lambda a, b: _pair(settings, a, b, one, two))(first, second)
+    good &= mask
+    depth = median(1 / jnp.where(good, base.point[:, 3], 1.0), good)
+    empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (keyframes, *x.shape)), SE3.identity())
+    frames = jax.tree.map(lambda e, a, b: e.astype(dtype).at[0].set(a).at[1].set(b), empty, one, two)
+    # The first pose is the gauge; the velocity is all but unknown.
+    sd = jnp.repeat(
+        jnp.stack([1e-6 * depth, jnp.asarray(1e-6, dtype), 0.05 * depth, jnp.asarray(0.05, dtype)]), 3
+    )
+    belief = ekf.Belief(Twist(one, jnp.zeros(6, dtype)), jnp.diag(sd**2))
+    tracks = Tracks(first, jnp.where(mask, 0, -1), base, good, good)
+    made = jnp.asarray(2)
+    return State(belief, tracks, frames, made, second, mask, depth, jnp.asarray(0))
+
+
+def judge(
+    settings: Settings,
+    updated: ekf.Belief,
+    predicted: ekf.Belief,
+    diagnostics: ekf.Diagnostics,
+    mask: Bool[Array, " n"],
+    coasted: Int[Array, ""],
+) -> tuple[ekf.Belief, Bool[Array, ""], Int[Array, ""], Int[Array, ""]]:
+    """The belief to go on with: the update where enough points agree, else the prediction, and the status.
+
+    Also whether the update stands, and the frames coasted since the last that did.
+    """
+    count = jnp.sum(mask).astype(settings.minimum.dtype)
+    agreeing = diagnostics.used >= jnp.maximum(settings.minimum, 0.25 * count)
+    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(updated)])
+    ok = agreeing & jnp.all(finite)
+    belief = jax.tree.map(lambda a, b: jnp.where(ok, a, b), updated, predicted)
+    coasted = jnp.where(ok, 0, coasted + 1)
+    status = jnp.where(
+        ok, Status.TRACKING, jnp.where(coasted > settings.patience, Status.LOST, Status.COASTING)
+    )
+    return belief, ok, coasted, status
+
+
+def median(x: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Median of the unmasked entries; 1 where there is none."""
+    ordered = jnp.sort(jnp.where(mask, x, jnp.inf))
+    count = jnp.sum(mask)
+    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], jnp.ones((), x.dtype))
+
+
+def _pair(
+    settings: Settings, first: Float[Array, "2"], second: Float[Array, "2"], one: SE3, two: SE3
+) -> tuple[BasePoint, Bool[Array, ""], Float[Array, ""]]:
+    """The base point of a pair, whether the two views agree on it, and its parallax in radians."""
+    relative = two @ one.inverse()
+    R, T = relative.rotation().as_matrix(), relative.translation()
+    angle = parallax(first, second, R)
+    distance = sampson(essential(R, T), first, second)
+    ahead = inverse_depth(first, second, R, T, T) > 0
+    good = ahead & (jnp.abs(distance) < settings.epipolar_gate)
+    return base_point(first, second, one, two), good, angle
+
+
+def _rebase(
+    settings: Settings, state: State, pose: SE3, observed: Array, visible: Array
+) -> tuple[Tracks, SE3]:
+    """A new keyframe: new tracks get their first base frame, waiting ones their second."""
+    tracks = state.tracks
+    slot = state.made % state.keyframes.wxyz_xyz.shape[0]
+    frames = jax.tree.map(lambda all_, p: all_.at[slot].set(p), state.keyframes, pose)
+    # A waiting track whose first base frame has just been overwritten starts again from here.
+    keyframe = jnp.where((tracks.keyframe == slot) & ~tracks.fixed, -1, tracks.keyframe)
+    waiting = visible & (keyframe >= 0) & ~tracks.fixed
+    ones = jax.tree.map(lambda all_: all_[jnp.maximum(keyframe, 0)], frames)
+    base, good, angle = jax.vmap(lambda a, b, one: _pair(settings, a, b, one, pose))(
+        tracks.first, observed, ones
+    )
+    better = waiting & good & (angle > settings.usable_parallax)
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(better.reshape(-1, *([1] * (new.ndim - 1))), new, old)
+
+    begins = visible & (keyframe < 0)
+    return (
+        Tracks(
+            jnp.where(begins[:, None], observed, tracks.first),
+            jnp.where(begins, slot, keyframe),
+            jax.tree.map(choose, base, tracks.base),
+            tracks.usable | better,
+            tracks.fixed | (better & (angle > settings.fixed_parallax)),
+        ),
+        frames,
+    )
+
+
+def step(
+    settings: Settings,
+    state: State,
+    observed: Float[Array, "n 2"],
+    visible: Bool[Array, " n"],
+    fresh: Bool[Array, " n"],
+    dt: Float[Array, ""] | float = 1.0,
+    *,
+    hold: Bool[Array, ""] | bool = False,
+) -> tuple[State, Report]:
+    """One frame: predict, update with the tracks that have a base pair, keep a keyframe when it is time.
+
+    `observed` are normalised points in slots, `visible` the slots that hold one, `fresh` those whose track
+    begins here (whatever the slot held before is forgotten). `hold` makes no keyframe. Where too few points
+    agree the state is the prediction and the status says so.
+    """
+    observed = jnp.where(visible[:, None], observed, jnp.zeros((), observed.dtype))
+    old = state.tracks
+    keep = visible & ~fresh
+    tracks = Tracks(
+        old.first, jnp.where(keep, old.keyframe, -1), old.base, old.usable & keep, old.fixed & keep
+    )
+    held = state.held & keep
+
+    model = _model(settings, state.depth)
+    predicted = ekf.predict(model, state.belief, dt)
+    mask = tracks.usable
+    updated, diagnostics = ekf.update(
+        model, predicted, tracks.base, observed, mask, passes=settings.passes, robust=settings.robust
+    )
+    belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, mask, state.coasted)
+    drop = ok & mask & (diagnostics.distance > settings.outlier)
+    visible = visible & ~drop
+    tracks = Tracks(
+        tracks.first,
+        jnp.where(drop, -1, tracks.keyframe),
+        tracks.base,
+        tracks.usable & ~drop,
+        tracks.fixed & ~drop,
+    )
+    held &= ~drop
+
+    flow = median(jnp.sqrt(jnp.sum((observed - state.seen) ** 2, axis=-1)), held)
+    live = jnp.sum(visible).astype(observed.dtype)
+    usable = jnp.sum(tracks.usable & visible).astype(observed.dtype)
+    due = (flow > settings.keyframe_flow) | (jnp.sum(held) < settings.keyframe_common)
+    due |= usable < settings.keyframe_usable * live
+    keyframe = due & ok & ~jnp.asarray(hold)
+
+    interim = state._replace(tracks=tracks)
+    rebased, frames = _rebase(settings, interim, belief.mean.pose, observed, visible)
+    pick = lambda new, before: jax.tree.map(lambda a, b: jnp.where(keyframe, a, b), new, before)  # noqa: E731
+    depths = belief.mean.pose.rotation().as_matrix()[2] @ tracks.base.point[:, :3].T
+    depths = depths + belief.mean.pose.translation()[2] * tracks.base.point[:, 3]
+    inverse = tracks.base.point[:, 3]
+    depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9)
+    depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
+    new = State(
+        belief=belief,
+        tracks=pick(rebased, tracks),
+        keyframes=pick(frames, state.keyframes),
+        made=state.made + keyframe,
+        seen=pick(observed, state.seen),
+        held=pick(visible, held),
+        depth=depth,
+        coasted=coasted,
+    )
+    report = Report(belief.mean.pose, belief.covariance[:6, :6], status, keyframe, drop, diagnostics)
+    return new, report
+
+
+def filter(
+    settings: Settings,
+    state: State,
+    observed: Float[Array, "t n 2"],
+    visible: Bool[Array, "t n"],
+    fresh: Bool[Array, "t n"],
+    dt: Float[Array, " t"] | None = None,
+) -> tuple[State, Report]:
+    """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan."""
+    if dt is None:
+        dt = jnp.ones(observed.shape[0], observed.dtype)
+    return jax.lax.scan(
+        lambda carry, frame: step(settings, carry, *frame), state, (observed, visible, fresh, dt)
+    )

@@ -1,0 +1,107 @@
+"""Maximum-likelihood pose of two views, with its covariance: the initial belief of every filter here."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxlie import SO3
+from jaxtyping import Array, Bool, Float
+
+from jaxtri.geometry.epipolar import essential, safe_norm, sampson
+
+
+class TwoView(eqx.Module):
+    """Relative pose X2 = R X1 + T of two views, and how well it is known.
+
+    `covariance` is that of the errors (T, R): a sum in T, `exp(delta) R` in R. It has no part along T, whose
+    length is the gauge. `rms` is the root mean square of the Sampson distances, in units of sigma.
+    """
+
+    translation: Float[Array, "3"]
+    rotation: SO3
+    covariance: Float[Array, "6 6"]
+    rms: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def _tangent(n: Float[Array, "3"]) -> Float[Array, "3 2"]:
+    """Orthonormal basis of the plane perpendicular to the unit vector n (Duff et al. 2017)."""
+    sign = jnp.where(n[2] < 0, -1.0, 1.0).astype(n.dtype)
+    a = -1 / (sign + n[2])
+    b = n[0] * n[1] * a
+    return jnp.stack(
+        [
+            jnp.stack([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]]),
+            jnp.stack([b, sign + n[1] ** 2 * a, -n[1]]),
+        ],
+        axis=1,
+    )
+
+
+def refine(
+    translation: Float[Array, "3"],
+    rotation: SO3,
+    u1: Float[Array, "n 2"],
+    u2: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    sigma: Float[Array, ""] | float,
+    *,
+    prior: Float[Array, "6 6"] | None = None,
+    huber: float = 2.0,
+    max_steps: int = 64,
+) -> TwoView:
+    """Pose that minimises the robust Sampson distances of the pairs, with |T| as given.
+
+    `u1`, `u2` are normalised points with noise `sigma`; masked pairs count nothing. `prior` is the covariance
+    of the given pose, errors (T, R), where the estimate is to be combined with what was known (its part along
+    T counts nothing). Distances beyond `huber` sigmas count linearly. The Sampson distance is, to first
+    order, the residual left when every point's structure is eliminated (Hartley & Zisserman 2004, 11.4.3).
+    """
+    dtype = translation.dtype
+    sigma = jnp.asarray(sigma, dtype)
+    length = safe_norm(translation)
+    basis = _tangent(translation / length)
+    valid = mask.astype(dtype)
+    u1, u2 = (jnp.where(mask[:, None], u, jnp.zeros((), dtype)) for u in (u1, u2))
+    root = None
+    if prior is not None:
+        lift = jax.scipy.linalg.block_diag(basis.T / length, jnp.eye(3, dtype=dtype))
+        known = lift @ prior @ lift.T
+        s = jnp.sqrt(jnp.diagonal(known))
+        scaled = jnp.linalg.cholesky(known / jnp.outer(s, s))
+        root = jax.scipy.linalg.solve_triangular(scaled, jnp.diag(1 / s), lower=True)
+
+    def pose(x: Float[Array, "5"]) -> tuple[Array, SO3]:
+        T = translation / length + basis @ x[:2]
+        return T / safe_norm(T) * length, SO3.exp(x[2:]) @ rotation
+
+    def distances(x: Float[Array, "5"]) -> Array:
+        T, R = pose(x)
+        E = essential(R.as_matrix(), T / length)
+        return jax.vmap(lambda a, b: sampson(E, a, b))(u1, u2) / sigma * valid
+
+    def residuals(x: Float[Array, "5"], _: None) -> Array:
+        d = distances(x)
+        large = jnp.abs(d) > huber
+        # sqrt of twice the Huber loss, so that least squares minimises it.
+        safe = jnp.where(large, jnp.abs(d), huber)
+        r = jnp.where(large, jnp.sign(d) * jnp.sqrt(2 * huber * safe - huber**2), d)
+        return r if root is None else jnp.concatenate([r, root @ x])
+
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+    solution = optx.least_squares(residuals, solver, jnp.zeros(5, dtype), max_steps=max_steps, throw=False)
+    x = solution.value
+    J = jax.jacfwd(lambda y: residuals(y, None))(x)
+    A = J.T @ J
+    s = 1 / jnp.sqrt(jnp.where(jnp.diagonal(A) > 0, jnp.diagonal(A), 1))
+    inside = jnp.outer(s, s) * jnp.linalg.solve(A * jnp.outer(s, s), jnp.eye(5, dtype=dtype))
+    T, R = pose(x)
+    onto = _tangent(T / length)
+    J_T = jax.jacfwd(lambda y: pose(y)[0])(x)
+    J_R = jax.jacfwd(lambda y: (pose(y)[1] @ R.inverse()).log())(x)
+    lift = jnp.concatenate([onto @ (onto.T @ J_T), J_R])
+    d = distances(x)
+    inlier = jnp.abs(d) < 3
+    rms = jnp.sqrt(jnp.sum(jnp.where(inlier, d**2, 0)) / jnp.maximum(jnp.sum(valid * inlier), 1))
+    ok = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(x))
+    return TwoView(T, R, lift @ ((inside + inside.T) / 2) @ lift.T, rms, ok)

@@ -1,0 +1,162 @@
+"""Relative poses of two views: hypotheses from OpenCV, refined by maximum likelihood."""
+
+from typing import NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxlie import SO3
+from jaxtyping import Array, Bool, Float
+
+from jaxtri import two_view
+from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
+
+HYPOTHESES = 8  # of fixed number, so that one compilation serves
+
+
+class Hypothesis(NamedTuple):
+    """A refined relative pose, what it costs, and which tracks agree with it."""
+
+    pose: two_view.TwoView
+    cost: float  # sum of squared Sampson distances over sigma, truncated at 16
+    inside: np.ndarray  # (n,) bool: within 4 sigmas and in front of both cameras
+    parallax_deg: float  # median over those
+
+
+def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_point: bool = False) -> list:
+    """Relative poses (R, T) from robust essential matrices; empty where OpenCV finds none.
+
+    Normalised points (n, 2), `threshold` in the same units. With `eight_point` the paper's way: the 8-point
+    algorithm inside RANSAC (Yu et al. 2006, section III).
+    """
+    found = []
+    for method in (cv2.FM_RANSAC,) if eight_point else (cv2.USAC_MAGSAC, cv2.RANSAC):
+        try:
+            if eight_point:
+                E = _eight_point(u1, u2, threshold)
+            else:
+                E, _ = cv2.findEssentialMat(
+                    u1, u2, np.eye(3), method=method, prob=0.9999, threshold=threshold
+                )
+        except cv2.error:  # a degenerate sample: no hypothesis
+            continue
+        if E is None or not np.isfinite(E).all():
+            continue
+        for stacked in E.reshape(-1, 3, 3):  # the five-point solver may return several
+            # Points beyond 50 base lines are dropped by default, which at video rate is nearly all of them.
+            _, R, T, _, _ = cv2.recoverPose(stacked, u1, u2, np.eye(3), distanceThresh=1e9)
+            found.append((R, T.ravel()))
+    return found
+
+
+def _eight_point(u1: np.ndarray, u2: np.ndarray, threshold: float) -> np.ndarray | None:
+    """Essential matrix by RANSAC over 8-point samples, then the 8-point fit to all inliers."""
+    # OpenCV's own RANSAC wants pixels; a focal length of 1000 only keeps its thresholds in a usual range.
+    F, mask = cv2.findFundamentalMat(u1 * 1000, u2 * 1000, cv2.FM_RANSAC, threshold * 1000, 0.9999)
+    if F is None or F.shape != (3, 3) or mask is None or mask.sum() < 8:
+        return None
+    inside = mask.ravel() == 1
+    F, _ = cv2.findFundamentalMat(u1[inside] * 1000, u2[inside] * 1000, cv2.FM_8POINT)
+    if F is None or F.shape != (3, 3):
+        return None
+    S = np.diag([1000.0, 1000.0, 1.0])
+    U, _, Vt = np.linalg.svd(S @ F @ S)
+    return U @ np.diag([1.0, 1.0, 0.0]) @ Vt
+
+
+def homography_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:
+    """Relative poses (R, T) of a plane that fills the view; empty where there is none, or no translation."""
+    try:
+        H, mask = cv2.findHomography(u1, u2, cv2.USAC_MAGSAC, threshold, maxIters=2000, confidence=0.9999)
+    except cv2.error:
+        return []
+    if H is None or mask is None or mask.sum() < 8:
+        return []
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    x1 = np.c_[u1, np.ones(len(u1))][mask.ravel() == 1]
+    found = []
+    for R, T, n in zip(rotations, translations, normals, strict=True):
+        ahead = np.mean(x1 @ n.ravel() > 0) > 0.9  # the plane lies in front of the first camera
+        if ahead and np.linalg.norm(T) > 1e-9:
+            found.append((R, T.ravel() / np.linalg.norm(T)))
+    return found
+
+
+class _Refined(NamedTuple):
+    pose: two_view.TwoView
+    cost: Float[Array, ""]
+    inside: Bool[Array, " n"]
+    parallax: Float[Array, ""]
+
+
+@jax.jit
+def _refine(
+    R: Float[Array, "h 3 3"],
+    T: Float[Array, "h 3"],
+    u1: Float[Array, "n 2"],
+    u2: Float[Array, "n 2"],
+    mask: Bool[Array, "h n"],
+    common: Bool[Array, " n"],
+    sigma: Float[Array, ""],
+) -> _Refined:
+    """Every hypothesis refined on its own tracks, then judged on all common ones."""
+
+    def one(R: Array, T: Array, mask: Array) -> _Refined:
+        pose = two_view.refine(T, SO3.from_matrix(R), u1, u2, mask, sigma)
+        R, T = pose.rotation.as_matrix(), pose.translation
+        distance = jax.vmap(lambda a, b: sampson(essential(R, T), a, b))(u1, u2) / sigma
+        inverse = jax.vmap(lambda a, b: inverse_depth(a, b, R, T, T))(u1, u2)
+        inside = common & (jnp.abs(distance) < 4) & (inverse > 0)
+        cost = jnp.sum(jnp.where(common, jnp.where(inside, distance**2, 16.0), 0.0))
+        angle = jax.vmap(lambda a, b: parallax(a, b, R))(u1, u2)
+        return _Refined(pose, cost, inside, jnp.nanmedian(jnp.where(inside, angle, jnp.nan)))
+
+    return jax.vmap(one)(R, T, mask)
+
+
+def hypotheses(
+    u1: np.ndarray,
+    u2: np.ndarray,
+    mask: np.ndarray,
+    sigma: Array,
+    threshold: float,
+    *,
+    eight_point: bool = False,
+) -> list[Hypothesis]:
+    """Relative poses that may explain two views, refined, different from each other, the best first.
+
+    `u1`, `u2` (n, 2) are normalised points in slots with noise `sigma`, `mask` (n,) those seen in both;
+    `threshold` is that of the robust estimators. Essential matrices and the decomposition of a homography
+    compete, so that a plane (which has two poses) and a general scene are both served; with `eight_point`
+    only the paper's way. Empty where nothing fits.
+    """
+    a, b = u1[mask].astype(np.float64), u2[mask].astype(np.float64)
+    if len(a) < 8:
+        return []
+    poses = essential_poses(a, b, threshold, eight_point=eight_point)
+    if not eight_point:
+        poses += homography_poses(a, b, threshold)
+    if not poses:
+        return []
+    poses = (poses + [poses[0]] * HYPOTHESES)[:HYPOTHESES]
+    R, T = (jnp.asarray(np.stack(x), sigma.dtype) for x in zip(*poses, strict=True))
+    first, second = (jnp.asarray(np.where(mask[:, None], u, 0), sigma.dtype) for u in (u1, u2))
+    common = jnp.asarray(mask)
+    rough = _refine(R, T, first, second, jnp.broadcast_to(common, (HYPOTHESES, len(mask))), common, sigma)
+    fine = _refine(
+        rough.pose.rotation.as_matrix(), rough.pose.translation, first, second, rough.inside, common, sigma
+    )
+    cost = np.where(np.isfinite(np.asarray(fine.cost)), np.asarray(fine.cost), np.inf)
+    found: list[Hypothesis] = []
+    for k in np.argsort(cost):
+        pose = jax.tree.map(lambda x, k=k: x[k], fine.pose)
+        if np.isfinite(cost[k]) and all(_apart(pose, h.pose) for h in found):
+            degrees = float(np.rad2deg(fine.parallax[k]))
+            found.append(Hypothesis(pose, float(cost[k]), np.asarray(fine.inside[k]), degrees))
+    return found
+
+
+def _apart(a: two_view.TwoView, b: two_view.TwoView) -> bool:
+    turn = np.linalg.norm((a.rotation @ b.rotation.inverse()).log())
+    return bool(turn > 1e-3 or np.linalg.norm(a.translation - b.translation) > 2e-2)

@@ -1,0 +1,193 @@
+"""Feature tracks from images: Shi-Tomasi corners followed by pyramidal Lucas-Kanade, through OpenCV."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from jaxtri.errors import ResolutionChangeError
+
+
+@dataclass(frozen=True)
+class KLTSettings:
+    """How features are found and followed; lengths in pixels."""
+
+    capacity: int = 800  # slots for features; also the most that are followed at once
+    quality: float = 0.005  # smallest corner strength, as a share of the best corner's
+    spacing: float = 8.0  # smallest distance between two features
+    window: int = 13  # side of the patch
+    levels: int = 4  # pyramid levels beyond the image itself
+    forward_backward: float = 0.7  # largest distance after tracking there and back
+    anchor_move: float = 1.5  # largest correction by the anchor patch before it is given up
+    refill: float = 0.8  # share of the capacity below which new corners are sought
+    cells: int = 8  # the image is divided into cells x cells, each with its share of the features
+
+
+class FrameTracks(NamedTuple):
+    """Features of one frame in fixed slots.
+
+    A slot keeps its feature from frame to frame as long as `visible` stays True; `fresh` marks the slots
+    whose feature is seen for the first time. `ids` number the features; `error` is the forward-backward
+    distance in pixels.
+    """
+
+    pixels: np.ndarray  # (n, 2) float64
+    visible: np.ndarray  # (n,) bool
+    fresh: np.ndarray  # (n,) bool
+    ids: np.ndarray  # (n,) int64
+    error: np.ndarray  # (n,) float64
+
+
+@dataclass
+class KLT:
+    """A feature tracker fed one image at a time.
+
+    Each patch is followed from frame to frame and then re-aligned with the frame it was found in (its
+    anchor), against drift; when it has changed too much for that, the present frame becomes its anchor.
+    """
+
+    settings: KLTSettings = field(default_factory=KLTSettings)
+
+    def __post_init__(self) -> None:
+        n = self.settings.capacity
+        self._pixels = np.zeros((n, 2), np.float32)
+        self._alive = np.zeros(n, bool)
+        self._ids = np.full(n, -1, np.int64)
+        self._anchor = np.full(n, -1, np.int64)
+        self._anchor_pixels = np.zeros((n, 2), np.float32)
+        self._anchors: dict[int, np.ndarray] = {}
+        self._previous: np.ndarray | None = None
+        self._frame = -1
+        self._next_id = 0
+        self._shape: tuple[int, ...] | None = None
+
+    def track(self, image: np.ndarray) -> FrameTracks:
+        """Follow all features into `image` (h, w) or (h, w, 3) uint8, and fill the free slots.
+
+        Raises `ResolutionChangeError` when the image is not of the first one's size.
+        """
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        self._frame += 1
+        if self._shape is not None and gray.shape != self._shape:
+            (h0, w0), (h, w) = self._shape[:2], gray.shape[:2]
+            raise ResolutionChangeError(
+                f"frame {self._frame} is {w}x{h}, the frames before it {w0}x{h0}: split the video there"
+            )
+        self._shape = gray.shape
+        error = np.zeros(self.settings.capacity)
+        if self._previous is not None and self._alive.any():
+            slots = np.flatnonzero(self._alive)
+            moved, ok, fb = self._flow(self._previous, gray, self._pixels[slots], None, self.settings.levels)
+            self._pixels[slots] = moved
+            error[slots] = fb
+            self._alive[slots] = ok & self._inside(moved)
+            self._realign(gray, error)
+            self._separate()
+        fresh = np.zeros(self.settings.capacity, bool)
+        if self._alive.sum() < self.settings.refill * self.settings.capacity:
+            fresh = self._fill(gray)
+        self._previous = gray
+        used = set(self._anchor[self._alive].tolist())
+        self._anchors = {k: v for k, v in self._anchors.items() if k in used}
+        return FrameTracks(
+            self._pixels.astype(np.float64), self._alive.copy(), fresh, self._ids.copy(), error
+        )
+
+    def drop(self, slots: np.ndarray) -> None:
+        """Give up the features of a boolean mask (n,): the filter found them to be outliers."""
+        self._alive &= ~slots
+
+    def _flow(
+        self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray, guess: np.ndarray | None, levels: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions in `b`, whether tracking there and back agrees, and by how many pixels it does not."""
+        s = self.settings
+        window, stop = (s.window, s.window), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
+        start = (pixels if guess is None else guess).reshape(-1, 1, 2).copy()
+        origin = pixels.reshape(-1, 1, 2)
+        flags = cv2.OPTFLOW_USE_INITIAL_FLOW  # without a guess the flow starts from standing still, as it would
+        there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, origin, start, None, None, window, levels, stop, flags)
+        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, origin.copy(), None, None, window, levels, stop, flags)
+        there, back = there.reshape(-1, 2), back.reshape(-1, 2)
+        distance = np.linalg.norm(back - pixels, axis=1)
+        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (distance < s.forward_backward)
+        return there, np.asarray(good & np.isfinite(there).all(axis=1)), distance
+
+    def _realign(self, gray: np.ndarray, error: np.ndarray) -> None:
+        for frame in np.unique(self._anchor[self._alive]):
+            slots = np.flatnonzero(self._alive & (self._anchor == frame))
+            if frame == self._frame - 1:
+                continue
+            guess = self._pixels[slots]
+            moved, ok, fb = self._flow(self._anchors[int(frame)], gray, self._anchor_pixels[slots], guess, 0)
+            ok &= np.linalg.norm(moved - guess, axis=1) < self.settings.anchor_move
+            self._pixels[slots[ok]] = moved[ok]
+            error[slots[ok]] = fb[ok]
+            self._set_anchor(slots[~ok], gray)
+
+    def _set_anchor(self, slots: np.ndarray, gray: np.ndarray) -> None:
+        if slots.size:
+            self._anchor[slots] = self._frame
+            self._anchor_pixels[slots] = self._pixels[slots]
+            self._anchors[self._frame] = gray
+
+    def _inside(self, pixels: np.ndarray) -> np.ndarray:
+        assert self._shape is not None
+        h, w = self._shape[:2]
+        margin = self.settings.window // 4
+        return ((pixels >= margin) & (pixels < np.array([w, h]) - margin)).all(axis=1)
+
+    def _separate(self) -> None:
+        """Of features that have run into each other only the oldest stays."""
+        slots = np.flatnonzero(self._alive)
+        if slots.size < 2:
+            return
+        slots = slots[np.argsort(self._ids[slots])]
+        cell = np.floor(self._pixels[slots] / (self.settings.spacing / 2)).astype(np.int64)
+        _, first = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_index=True)
+        lost = np.ones(slots.size, bool)
+        lost[first] = False
+        self._alive[slots[lost]] = False
+
+    def _fill(self, gray: np.ndarray) -> np.ndarray:
+        s = self.settings
+        mask = np.full(gray.shape[:2], 255, np.uint8)
+        for x, y in self._pixels[self._alive]:
+            cv2.circle(mask, (round(float(x)), round(float(y))), int(s.spacing), 0, -1)
+        corners = cv2.goodFeaturesToTrack(
+            gray, 4 * s.capacity, s.quality, s.spacing, mask=mask, blockSize=5, useHarrisDetector=False
+        )
+        fresh = np.zeros(s.capacity, bool)
+        if corners is None:  # a blank image
+            return fresh
+        corners = corners.reshape(-1, 2)
+        corners = corners[self._inside(corners)]
+        corners = corners[self._spread(corners)]
+        slots = np.flatnonzero(~self._alive)[: len(corners)]
+        corners = corners[: slots.size]
+        self._pixels[slots] = corners
+        self._alive[slots] = True
+        self._ids[slots] = np.arange(self._next_id, self._next_id + slots.size)
+        self._next_id += slots.size
+        self._set_anchor(slots, gray)
+        fresh[slots] = True
+        return fresh
+
+    def _spread(self, corners: np.ndarray) -> np.ndarray:
+        """Order of the corners that fills the emptiest cells first, the strongest corner of each before."""
+        assert self._shape is not None
+        h, w = self._shape[:2]
+        g = self.settings.cells
+
+        def cell(p: np.ndarray) -> np.ndarray:
+            return (p[:, 1] * g / h).astype(int).clip(0, g - 1) * g + (p[:, 0] * g / w).astype(int).clip(
+                0, g - 1
+            )
+
+        held = np.bincount(cell(self._pixels[self._alive]), minlength=g * g)
+        cells = cell(corners)
+        rank = np.zeros(len(corners), int)
+        for c in np.unique(cells):  # corners come in order of strength
+            rank[cells == c] = held[c] + np.arange((cells == c).sum())
+        return np.argsort(rank, kind="stable")

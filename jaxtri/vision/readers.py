@@ -1,0 +1,165 @@
+"""What `jaxtri.vision.video` reads from: OpenCV's captures and folders of images, one frame at a time."""
+
+import contextlib
+import math
+import os
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxtri.errors import VideoError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+"""The files of a folder that count as frames; case does not matter."""
+
+Item = tuple[int, float | None, np.ndarray | str]
+"""Index, time in seconds if known, and the image, or the reason why it cannot be decoded."""
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep OpenCV and FFmpeg from printing what is reported as an error or warning here."""
+    # Where the level lives has changed: `cv2.setLogLevel` in 4, `cv2.utils.logging` in 5.
+    module: Any = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging", None)
+    level = module.getLogLevel() if module else 0
+    # FFmpeg's own level is read from here once, at the first opening of a process.
+    added = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
+    if added:
+        os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
+    try:
+        if module:
+            module.setLogLevel(0)
+        yield
+    finally:
+        if module:
+            module.setLogLevel(level)
+        if added:
+            os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
+
+
+class Capture:
+    """A video file or camera read by OpenCV."""
+
+    def __init__(self, source: str | int, name: str):
+        self.index, self.live = 0, isinstance(source, int)
+        self.start: float | None = None
+        with quiet():
+            self.capture = cv2.VideoCapture(source)
+            opened = self.capture.isOpened()
+        if not opened:
+            hint = (
+                "is it connected and free?"
+                if self.live
+                else "not a video that OpenCV can decode, or cut short"
+            )
+            raise VideoError(f"{name}: cannot be opened; {hint}")
+        count, fps = self.capture.get(cv2.CAP_PROP_FRAME_COUNT), self.capture.get(cv2.CAP_PROP_FPS)
+        # Containers without an index give nonsense (-9e18 for a bare MJPEG stream).
+        self.declared = int(count) if not self.live and 0 < count < 1e9 else None
+        self.fps = fps if 0 < fps < 1e4 else None
+
+    def read(self) -> Item | None:
+        """The next frame, or None at the end (a file) or when the camera stops giving any."""
+        with quiet():
+            ok, image = self.capture.read()
+        if not ok:
+            return None
+        if self.live:
+            now = time.monotonic()
+            self.start = now if self.start is None else self.start
+            stamp: float | None = now - self.start
+        else:
+            seconds = self.capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            stamp = seconds if 0 <= seconds < 1e9 else None
+        self.index += 1
+        return self.index - 1, stamp, image
+
+    def close(self) -> None:
+        """Release the file or camera."""
+        self.capture.release()
+
+
+class Folder:
+    """The images of a folder."""
+
+    def __init__(self, folder: Path):
+        self.files = _images(folder) or _images(folder / "frames")
+        if not self.files:
+            raise VideoError(
+                f"{folder}: no images here or in {folder / 'frames'} ({', '.join(IMAGE_SUFFIXES)})"
+            )
+        self.times: list[float] | None = None
+        home = self.files[0].parent
+        for stamps in (home / "timestamps.txt", home.parent / "timestamps.txt"):
+            if stamps.is_file():
+                self.times, self.files = _read_timestamps(stamps, self.files)
+                break
+        self.declared = len(self.files)
+        self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
+        self.index = -1
+
+    def read(self) -> Item | None:
+        """The next image, or why it cannot be decoded; None at the end."""
+        self.index += 1
+        if self.index >= len(self.files):
+            return None
+        time_s = None if self.times is None else self.times[self.index]
+        return self.index, time_s, _read_image(self.files[self.index])
+
+    def close(self) -> None:
+        """Nothing is held open between images."""
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    return sorted(
+        files,
+        key=lambda p: [
+            (part.isdecimal(), int(part) if part.isdecimal() else 0, part)
+            for part in re.split(r"(\d+)", p.name)
+        ],
+    )
+
+
+def _read_image(path: Path) -> np.ndarray | str:
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        return f"{path.name} cannot be read ({error.strerror})"
+    # OpenCV 4 fills up a JPEG that was cut off; what is missing then is the end-of-image marker.
+    whole = data.size > 0 and (data[:2].tobytes() != b"\xff\xd8" or b"\xff\xd9" in data.tobytes())
+    with quiet():
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if whole else None
+    return f"{path.name} is not a readable image" if image is None else image
+
+
+def _read_timestamps(path: Path, images: list[Path]) -> tuple[list[float], list[Path]]:
+    lines = [(n, line.split()) for n, line in enumerate(path.read_text().splitlines(), 1)]
+    lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
+    if len(lines) != len(images):
+        raise VideoError(f"{path} has {len(lines)} lines for {len(images)} images in {images[0].parent}")
+    times: list[float] = []
+    for n, words in lines:
+        try:
+            time_s = float(words[0])
+        except ValueError:
+            time_s = math.nan
+        if not math.isfinite(time_s) or (times and time_s <= times[-1]):
+            raise VideoError(
+                f"{path}, line {n}: {words[0]!r} is not a time in seconds later than the one before"
+            )
+        times.append(time_s)
+    if all(len(words) > 1 for _, words in lines):
+        images = [path.parent / words[1] for _, words in lines]
+        if missing := [str(p) for p in images if not p.is_file()]:
+            raise VideoError(
+                f"{path} names {missing[0]}, which does not exist ({len(missing)} missing in all)"
+            )
+    return times, images

@@ -1,0 +1,208 @@
+"""Frames from a video file, a folder of images or a camera, with every way they can go wrong noticed."""
+
+import math
+import os
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxtri.errors import ResolutionChangeError, TruncatedVideoError, TruncatedVideoWarning, VideoError
+from jaxtri.io import atomic_path
+from jaxtri.vision.readers import IMAGE_SUFFIXES, Capture, Folder, Item, quiet
+
+DEFAULT_FPS = 25.0
+"""Frames a second of a source that has no clock of its own and was given none."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a source: its place in the source, its time in seconds and its pixels, BGR."""
+
+    index: int
+    time_s: float
+    image: UInt8[np.ndarray, "h w 3"]
+
+
+class _Reader(Protocol):
+    declared: int | None
+    fps: float | None
+
+    def read(self) -> Item | None:
+        """The next frame, or None at the end."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class FrameSource:
+    """The frames of a video, folder or camera: a one-pass iterator of `Frame` and a context manager.
+
+    `size` is (width, height) in pixels, `declared` the number of frames that the source claims to hold (None
+    if it makes no claim), `fps` its nominal rate, `decoded` the number of frames handed out so far. Times
+    increase strictly: a time that does not is replaced by the last one plus a frame. Gray and 16-bit images
+    come as 8-bit BGR. Build one with `open_source`, which documents the errors.
+    """
+
+    def __init__(self, name: str, reader: _Reader, fps: float | None, strict: bool):
+        self.name = name
+        self.declared = reader.declared
+        self.fps = fps or reader.fps or DEFAULT_FPS
+        self.decoded = 0
+        self._reader, self._strict, self._override = reader, strict, fps is not None
+        self._time = -math.inf
+        self._bad: list[str] = []
+        self._ended = False
+        # The first frame is decoded here, so that a source without any fails on opening.
+        try:
+            self._first = self._read()
+        except Exception:
+            reader.close()
+            raise
+        if self._first is None:
+            reader.close()
+            raise VideoError(
+                f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1])
+            )
+        self.size = _size(self._first)
+
+    def _read(self) -> Frame | None:
+        while (item := self._reader.read()) is not None:
+            index, stamp, image = item
+            if isinstance(image, str):
+                if self._strict:
+                    raise TruncatedVideoError(f"{self.name}: {image}")
+                self._bad.append(image)
+                continue
+            if stamp is None or self._override or not math.isfinite(stamp):
+                stamp = index / self.fps
+            if stamp <= self._time:
+                stamp = self._time + 1 / self.fps
+            self._time = stamp
+            return Frame(index, stamp, _bgr8(image))
+        return None
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    def __next__(self) -> Frame:
+        if self._ended:
+            raise StopIteration
+        frame, self._first = self._first or self._read(), None
+        if frame is None:
+            self._finish()
+            raise StopIteration
+        if (size := _size(frame)) != self.size:
+            self.close()
+            raise ResolutionChangeError(
+                f"{self.name}: frame {frame.index} is {size[0]}x{size[1]} pixels, those before it "
+                f"{self.size[0]}x{self.size[1]}; split the source where the size changes"
+            )
+        self.decoded += 1
+        return frame
+
+    def _finish(self) -> None:
+        self.close()
+        if self.declared is not None and self.decoded < self.declared:
+            message = f"{self.name}: {self.decoded} frames decoded of {self.declared} declared"
+            message += f" (first failure: {self._bad[0]})" if self._bad else "; the file ends early"
+            if self._strict:
+                raise TruncatedVideoError(message)
+            warnings.warn(message, TruncatedVideoWarning, stacklevel=3)
+
+    def close(self) -> None:
+        """Release the file or camera; the iteration ends."""
+        self._ended, self._first = True, None
+        self._reader.close()
+
+    def __enter__(self) -> "FrameSource":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def open_source(
+    source: str | os.PathLike[str] | int, *, fps: float | None = None, strict: bool = False
+) -> FrameSource:
+    """Open a video file, a folder of images, or a camera by its number (an integer or, say, "0").
+
+    A folder gives its images in natural order ("2" before "10"), or those of its subfolder `frames` if it has
+    none itself. A `timestamps.txt` beside them or one level above gives the times: seconds, then optionally
+    the file's name, a line a frame. `fps` overrides the times of any source. A camera's times count from its
+    first frame, by the clock of this computer.
+
+    Raises VideoError if there is nothing to read, the file is no video, or the time stamps do not fit the
+    images; ResolutionChangeError, while iterating, if the frame size changes (OpenCV's FFmpeg reader hides
+    such a change by rescaling; there it goes unseen). A frame that cannot be decoded is skipped, and a source
+    that ends early ends early: one TruncatedVideoWarning at the end gives both counts, or, with `strict`, a
+    TruncatedVideoError is raised at once.
+    """
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise VideoError(f"fps is {fps}; give frames a second as a positive number")
+    text = str(source)
+    path = Path(text)
+    if isinstance(source, int) or (text.isdecimal() and not path.exists()):
+        return FrameSource(f"camera {text}", Capture(int(text), f"camera {text}"), fps, strict)
+    if path.is_dir():
+        return FrameSource(text, Folder(path), fps, strict)
+    if not path.exists():
+        raise VideoError(f"{text}: no such file or folder")
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise VideoError(f"{text} is a single image; give the folder of the frames")
+    return FrameSource(text, Capture(text, text), fps, strict)
+
+
+def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> int:
+    """Write BGR uint8 images (h, w, 3) as a video file, which appears when complete; returns their number.
+
+    H.264 where OpenCV has an encoder, else MPEG-4 part 2 (Motion JPEG for `.avi`); an odd width or height
+    loses a row or column to them. Raises VideoError for no frames or if no codec opens, and
+    ResolutionChangeError if the images differ in size.
+    """
+    codecs = ("MJPG",) if Path(path).suffix.lower() == ".avi" else ("avc1", "mp4v")
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise VideoError(f"{path}: there are no frames to write")
+    h, w = first.shape[:2]
+    with atomic_path(path) as temporary:
+        writer = cv2.VideoWriter()
+        with quiet():
+            if not any(
+                writer.open(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, (w, h)) for codec in codecs
+            ):
+                raise VideoError(
+                    f"{path}: none of the codecs {', '.join(codecs)} opens; try a name in .mp4 or .avi"
+                )
+        count = 0
+        try:
+            image: np.ndarray | None = first
+            while image is not None:
+                if image.shape != (h, w, 3):
+                    raise ResolutionChangeError(
+                        f"{path}: frame {count} has shape {image.shape}, the first {(h, w, 3)}"
+                    )
+                writer.write(np.ascontiguousarray(image))
+                count += 1
+                image = next(frames, None)
+        finally:
+            writer.release()
+    return count
+
+
+def _size(frame: Frame) -> tuple[int, int]:
+    return frame.image.shape[1], frame.image.shape[0]
+
+
+def _bgr8(image: np.ndarray) -> np.ndarray:
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(image[..., :3])

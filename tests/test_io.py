@@ -1,0 +1,301 @@
+import json
+import math
+import struct
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxtri import io
+from jaxtri.errors import CameraError, InputError, TrajectoryError
+from jaxtri.geometry.camera import BrownConrady, Fisheye
+from jaxtri.trajectory import Trajectory
+
+GOOD = {"fx": 500.0, "fy": 510.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+ROS = """\
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo/left
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
+distortion_model: {model}
+distortion_coefficients:
+  rows: 1
+  cols: {n}
+  data: {values}
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+"""
+
+
+def write(path, content):
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def values(camera):
+    return [
+        float(camera.fx),
+        float(camera.fy),
+        float(camera.cx),
+        float(camera.cy),
+        camera.width,
+        camera.height,
+    ]
+
+
+def a_trajectory(t=20):
+    rng = np.random.default_rng(0)
+    T = np.eye(4)[None].repeat(t, 0)
+    T[:, :3, :3] = Rotation.random(t, rng=rng).as_matrix()
+    T[0, :3, :3] = np.diag([-1.0, 1, -1])  # half a turn: w is 0
+    T[:, :3, 3] = rng.normal(size=(t, 3)) * 10.0 ** np.arange(-5, 5).repeat(2)[:t, None]
+    return Trajectory(1403636579.763555 + 0.05 * np.arange(t), T)
+
+
+# Cameras
+
+
+def test_camera_json(tmp_path):
+    k = [-0.3, 0.08, 1e-3, 2e-3, 0.0]
+    entries = GOOD | {"model": "pinhole", "distortion_model": "opencv_radtan (k1,k2,..)", "distortion": k}
+    camera = io.read_camera(write(tmp_path / "c.json", entries | {"skew": -7.5}))
+    assert values(camera) == list(GOOD.values())
+    assert float(camera.skew) == -7.5
+    assert isinstance(camera.distortion, BrownConrady)
+    np.testing.assert_array_equal(camera.distortion.coefficients, [*k, 0, 0, 0])
+    assert io.read_camera(write(tmp_path / "c.json", entries | {"distortion": [0] * 5})).distortion is None
+    for name in ("fisheye", "opencv_fisheye", "kannala_brandt"):
+        for key in ("model", "distortion_model"):
+            fisheye = io.read_camera(write(tmp_path / "c.json", GOOD | {key: name, "distortion": [0.1, 0.2]}))
+            assert isinstance(fisheye.distortion, Fisheye)
+            np.testing.assert_array_equal(fisheye.distortion.coefficients, [0.1, 0.2, 0, 0])
+    bare = {key: value for key, value in GOOD.items() if key not in ("width", "height")}
+    path = write(tmp_path / "c.json", bare | {"cy": -1070.5})
+    assert (io.read_camera(path).width, io.read_camera(path, width=640).width) == (None, 640)
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
+@pytest.mark.parametrize("key", ["distortion_coefficients", "dist_coeffs"])
+def test_camera_of_opencv(tmp_path, suffix, key):
+    path = tmp_path / f"c.{suffix}"
+    k = np.array([[-0.3, 0.08, 1e-3, 2e-3, 0.1]])
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "today: 12:00")
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]))
+    storage.write(key, k)
+    storage.release()
+    camera = io.read_camera(path)
+    assert values(camera) == list(GOOD.values())
+    assert camera.distortion is not None
+    np.testing.assert_array_equal(camera.distortion.coefficients, [*k[0], 0, 0, 0])
+
+
+@pytest.mark.parametrize("head", ["", "---\n", "%YAML:1.0\n---\n", "# by a person\n"])
+def test_camera_of_ros(tmp_path, head):
+    for model, k, kind in (
+        ("plumb_bob", [-0.3, 0.1, 0, 0, 0], BrownConrady),
+        ("equidistant", [0.0] * 4, Fisheye),
+    ):
+        text = head + ROS.format(model=model, n=len(k), values=k)
+        camera = io.read_camera(write(tmp_path / "c.yaml", text))
+        assert values(camera) == list(GOOD.values())
+        assert isinstance(camera.distortion, kind)
+        np.testing.assert_array_equal(camera.distortion.coefficients[: len(k)], k)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": None}, "fx is missing; add it"),
+        ({"fx": 0}, "fx is 0"),
+        ({"fy": -3.5}, "fy is -3.5"),
+        ({"cx": float("nan")}, "cx is nan"),
+        ({"cy": float("inf")}, "cy is inf"),
+        ({"cx": "left"}, "cx is 'left'"),
+        ({"width": 0}, "width is 0"),
+        ({"height": float("inf")}, "height is inf"),
+        ({"height": 480.5}, "height is 480.5"),
+        ({"skew": float("nan")}, "skew is nan"),
+        ({"model": "omni"}, "'omni' is unknown; known are pinhole"),
+        ({"distortion_model": "fov"}, "'fov' is unknown; known are .*fisheye"),
+        ({"distortion": [float("nan")]}, "distortion is .*finite"),
+        ({"distortion": "none"}, "distortion is 'none'"),
+        ({"distortion": [0.1] * 12}, "prism"),
+        ({"model": "fisheye", "distortion": [0.1] * 5}, "model has 4"),
+        ({"camera_matrix": [1.0, 2.0]}, "camera_matrix is .*expected 9"),
+    ],
+)
+def test_bad_camera_names_file_and_key(tmp_path, change, message):
+    entries = {key: value for key, value in (GOOD | change).items() if value is not None}
+    with pytest.raises(CameraError, match=rf"bad\.json: .*{message}"):
+        io.read_camera(write(tmp_path / "bad.json", entries))
+
+
+def test_unreadable_cameras(tmp_path):
+    with pytest.raises(CameraError, match=r"640, but 1280 was asked for"):
+        io.read_camera(write(tmp_path / "c.json", GOOD), width=1280)
+    with pytest.raises(CameraError, match=r"none\.json: cannot be read"):
+        io.read_camera(tmp_path / "none.json")
+    for content in ("{", "[1, 2]", "", "fx 500\nfy", "<?xml version='1.0'?><a>", "\x00\x01\x02"):
+        with pytest.raises(CameraError, match=r"c\.txt: "):
+            io.read_camera(write(tmp_path / "c.txt", content))
+
+
+def test_shared_cameras_and_trajectories_if_present():
+    folders = [p.parent for p in (Path(__file__).parents[2] / "shared" / "data").glob("*/camera.json")]
+    if not folders:
+        pytest.skip("no shared data beside the repository")
+    for folder in folders:
+        camera = io.read_camera(folder / "camera.json")
+        trajectory = io.read_trajectory(folder / "groundtruth.txt")
+        assert camera.width is not None or folder.name == "tracks_oxford_dinosaur"
+        if (folder / "timestamps.txt").exists():
+            times = io.read_timestamps(folder / "timestamps.txt")
+            assert np.isin(trajectory.times, times).all()
+
+
+# Trajectories and time stamps
+
+
+@pytest.mark.parametrize("form", ["tum", "euroc", "kitti"])
+def test_trajectory_round_trip(tmp_path, form):
+    trajectory, path = a_trajectory(), tmp_path / "new" / "folder" / "t.txt"
+    getattr(io, f"write_{form}")(path, trajectory)
+    for back in (getattr(io, f"read_{form}")(path), io.read_trajectory(path)):
+        np.testing.assert_allclose(back.positions, trajectory.positions, rtol=1e-14)
+        np.testing.assert_allclose(back.rotations, trajectory.rotations, atol=1e-14)
+        expected = np.arange(20.0) if form == "kitti" else trajectory.times
+        np.testing.assert_allclose(back.times, expected, rtol=0, atol=3e-7)  # a double at 1.4e9 s
+    if form == "kitti":
+        np.testing.assert_array_equal(io.read_kitti(path, trajectory.times).times, trajectory.times)
+
+
+def test_quaternions_are_in_the_order_of_each_format(tmp_path):
+    q = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    T = np.eye(4)[None].copy()
+    T[0, :3, :3] = q.as_matrix()
+    io.write_tum(tmp_path / "t", Trajectory(np.zeros(1), T), header="two\nlines")
+    lines = (tmp_path / "t").read_text().splitlines()
+    assert lines[:2] == ["# two", "# lines"]
+    np.testing.assert_allclose([float(x) for x in lines[2].split()[4:]], q.as_quat())
+    io.write_euroc(tmp_path / "e", Trajectory(np.ones(1), T))
+    *_, line = (tmp_path / "e").read_text().splitlines()
+    assert line.startswith("1000000000,0,0,0,")
+    np.testing.assert_allclose([float(x) for x in line.split(",")[4:]], q.as_quat()[[3, 0, 1, 2]])
+
+
+def test_comments_blank_lines_and_further_columns_are_skipped(tmp_path):
+    tum = "\ufeff# head\n\n0 1 2 3 0 0 0 1  # the first\r\n\n1 1 2 3 0 0 0 1\n"
+    assert len(io.read_trajectory(write(tmp_path / "t", tum))) == 2
+    euroc = "#timestamp, p_RS_R_x [m], ...\n1000000000,1,2,3,1,0,0,0,0.1,0.2\n"
+    trajectory = io.read_trajectory(write(tmp_path / "t", euroc))
+    np.testing.assert_array_equal(trajectory.positions, [[1, 2, 3]])
+    np.testing.assert_array_equal(trajectory.times, [1.0])
+    stamps = "# seconds file\n0.0 frames/0.jpg\n0.1 a name with blanks.jpg\n\n0.2\n"
+    np.testing.assert_array_equal(io.read_timestamps(write(tmp_path / "t", stamps)), [0, 0.1, 0.2])
+
+
+ROW = "1 2 3 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (f"# x\n0 {ROW}\n1 1 2 3\n", "bad:3: expected 8 finite numbers"),
+        (f"0 {ROW}\n1 {ROW} 5\n", "bad:2: expected 8"),
+        (f"0 {ROW}\n1 one 2 3 0 0 0 1\n", "bad:2: .*got '1 one"),
+        (f"0 {ROW}\n1 nan 2 3 0 0 0 1\n", "bad:2: .*finite"),
+        (f"0 {ROW}\n\n0 {ROW}\n", "bad:3: timestamps must increase"),
+        (f"0 {ROW}\n1 1 2 3 0 0 0 2\n", "bad:2: the quaternion"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 -1 0\n", "bad:2: .*no rotation"),
+        ("1,2,3\n", "bad:1: expected 8 finite numbers .*ns"),
+        ("1 2 3\n", "bad: no known trajectory format.*TUM.*KITTI.*EuRoC"),
+        ("# nothing\n", "bad: no known trajectory format"),
+    ],
+)
+def test_bad_trajectory_names_file_and_line(tmp_path, content, message):
+    with pytest.raises(TrajectoryError, match=message):
+        io.read_trajectory(write(tmp_path / "bad", content))
+
+
+def test_bad_timestamps_and_missing_files(tmp_path):
+    for content, message in (
+        ("0 a\n1 b\n1 c\n", "bad:3: time stamps must increase"),
+        ("0 a\nb 1\n", "bad:2: expected 1 finite number "),
+        ("0\ninf\n", "bad:2"),
+        ("\n", "holds no data"),
+    ):
+        with pytest.raises(InputError, match=message):
+            io.read_timestamps(write(tmp_path / "bad", content))
+    with pytest.raises(InputError, match="cannot be read"):
+        io.read_timestamps(tmp_path)
+    with pytest.raises(TrajectoryError, match="cannot be read"):
+        io.read_trajectory(tmp_path / "none")
+
+
+# Writers
+
+
+def test_ply_holds_what_was_given(tmp_path):
+    rng = np.random.default_rng(0)
+    points, colours = rng.normal(size=(7, 3)), rng.integers(0, 256, (7, 3), dtype=np.uint8)
+    io.write_ply(tmp_path / "p.ply", points, colours, {"sigma": np.arange(7.0)})
+    head, _, body = (tmp_path / "p.ply").read_bytes().partition(b"end_header\n")
+    kinds = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
+    names = ["x", "y", "z", "red", "green", "blue", "sigma"]
+    assert kinds == [["uchar" if n in names[3:6] else "float", n] for n in names]
+    assert b"element vertex 7\n" in head
+    rows = np.array(list(struct.iter_unpack("<3f3Bf", body)))
+    np.testing.assert_array_equal(rows, np.c_[points.astype(np.float32), colours, np.arange(7)])
+    io.write_ply(tmp_path / "p.ply", points[:0])
+    assert (tmp_path / "p.ply").read_bytes().endswith(b"end_header\n")
+    for extra in ({"x": np.zeros(7)}, {"two words": np.zeros(7)}, {"sigma": np.zeros((7, 1))}):
+        with pytest.raises((InputError, TypeError)):
+            io.write_ply(tmp_path / "p.ply", points, colours, extra)
+
+
+def test_json_is_strict(tmp_path):
+    obj = {
+        "a": np.float32(1.5),
+        "b": jnp.arange(3),
+        "c": [math.nan, (np.inf, True)],
+        4: a_trajectory(2),
+        "n": None,
+    }
+    io.write_json(tmp_path / "j.json", obj)
+    back = json.loads((tmp_path / "j.json").read_text())
+    assert (back["a"], back["b"], back["c"], back["n"]) == (1.5, [0, 1, 2], [None, [None, True]], None)
+    assert np.shape(back["4"]["T_world_camera"]) == (2, 4, 4)
+
+
+def test_nothing_half_written_is_left(tmp_path):
+    path = tmp_path / "sub" / "file.txt"
+    with io.atomic_write(path) as file:
+        file.write("old\n")
+        assert not path.exists()
+
+    def interrupted():
+        with io.atomic_write(path) as file:
+            file.write("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    with pytest.raises(TypeError):
+        io.write_json(path, {"bad": object()})
+    assert path.read_bytes() == b"old\n"
+    with pytest.raises(InputError, match="nothing was written"), io.atomic_path(path):
+        pass
+    with io.atomic_path(path.with_suffix(".png")) as temporary:
+        assert cv2.imwrite(str(temporary), np.zeros((2, 2, 3), np.uint8))
+    assert sorted(p.name for p in path.parent.iterdir()) == ["file.png", "file.txt"]
