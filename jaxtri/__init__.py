@@ -13,3 +13,63 @@ Conventions, written here once:
 - Missing is False in a boolean mask; what stands in a masked entry changes nothing, NaN included.
 - The dtype follows the inputs; nothing here touches `jax.config`.
 """
+
+from jaxtri import ekf as ekf
+from jaxtri import segments as segments
+from jaxtri import tracker as tracker
+from jaxtri.ekf import Belief, Diagnostics, Robust
+from jaxtri.errors import (
+    CameraError,
+    InitialisationError,
+    InputError,
+    JaxtriError,
+    ResolutionChangeError,
+    TrajectoryError,
+    TruncatedVideoError,
+    TruncatedVideoWarning,
+    VideoError,
+)
+from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
+from jaxtri.models.base_pairs import BasePairs, BasePoint
+from jaxtri.models.motion import Kinematics, Twist
+from jaxtri.models.trifocal import Trifocal, TrifocalState
+from jaxtri.tracker import Settings, Status
+from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
+from jaxtri.two_view import TwoView, refine
+
+__all__ = [
+    "BasePairs",
+    "BasePoint",
+    "Belief",
+    "BrownConrady",
+    "Camera",
+    "CameraError",
+    "Diagnostics",
+    "Fisheye",
+    "InitialisationError",
+    "InputError",
+    "JaxtriError",
+    "Kinematics",
+    "ResolutionChangeError",
+    "Robust",
+    "Settings",
+    "Status",
+    "Trajectory",
+    "TrajectoryError",
+    "Trifocal",
+    "TrifocalState",
+    "TruncatedVideoError",
+    "TruncatedVideoWarning",
+    "Twist",
+    "TwoView",
+    "VideoError",
+    "align",
+    "ate_rmse",
+    "ekf",
+    "evaluate",
+    "nees",
+    "refine",
+    "relative_errors",
+    "segments",
+    "tracker",
+]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxtri import segments, tracker
 from jaxtri.ekf import Diagnostics
 from jaxtri.geometry.epipolar import inverse_depth
-from jaxtri.geometry.pose import compose
+from jaxtri.geometry.pose import compose, shear
 from jaxtri.models.base_pairs import BasePoint, base_point
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.two_view import TwoView, refine
@@ -117,14 +117,8 @@ def _transfer_cost(
 ) -> float:
     """Truncated squared distances of the points transferred to the frames between the pair."""
     pose = compose(h.pose.rotation, h.pose.translation)
-    state = _init(
-        settings,
-        jnp.asarray(first.u),
-        jnp.asarray(last.u),
-        jnp.asarray(h.inside),
-        pose,
-        world=_identity(settings),
-    )
+    arrays = jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(h.inside)
+    state = _init(settings, *arrays, pose, jnp.zeros((6, 6), settings.sigma.dtype), world=_identity(settings))
     cost, before = 0.0, first.index
     for frame in between:
         visible = first.common(frame) & h.inside
@@ -141,7 +135,7 @@ def _identity(settings: Settings) -> SE3:
 
 
 def fill(
-    settings: Settings, frames: list[Frame], pose: SE3, world: SE3, dt: list[float]
+    settings: Settings, frames: list[Frame], two_view: TwoView, world: SE3, dt: list[float]
 ) -> tuple[tracker.State, list[tuple[Frame, Report]]]:
     """Set up the tracker on the first and last of `frames`, whose relative pose is given, and run it over them.
 
@@ -149,7 +143,11 @@ def fill(
     """
     first, last = frames[0], frames[-1]
     common = first.common(last)
-    state = _init(settings, jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(common), pose, world=world)
+    pose = compose(two_view.rotation, two_view.translation)
+    J = shear(two_view.translation)
+    covariance = J @ two_view.covariance @ J.T
+    arrays = jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(common)
+    state = _init(settings, *arrays, pose, covariance, world=world)
     reports = []
     for frame, elapsed in zip(frames[1:], dt, strict=True):
         state, report = hold(settings, state, frame, first.common(frame) & common, elapsed)
@@ -370,7 +368,7 @@ class SinglePair:
             jnp.asarray(now.u),
             jnp.asarray(frame.common(now)),
             self.settings.sigma,
-            prior=segments.additive(own + 1e-12 * jnp.eye(6, dtype=own.dtype), T),
+            prior=shear(-T) @ (own + 1e-12 * jnp.eye(6, dtype=own.dtype)) @ shear(-T).T,
         )
         if not bool(refined.converged):
             return

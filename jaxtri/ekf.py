@@ -5,7 +5,7 @@ the manifold and the measurement of one item; the update sums over N items and n
 covariance of all of them. Nothing here knows of cameras.
 """
 
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ class Belief(eqx.Module, Generic[Mean]):
     covariance: Float[Array, "d d"]
 
 
+@runtime_checkable
 class Model(Protocol[Mean]):
     """What a filter asks of its problem; every method is a pure function of one item."""
 
@@ -159,17 +160,44 @@ def _distance(lin: _Linearisation) -> Array:
     return jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, lin.residual) ** 2, axis=-1)
 
 
+def transition(model: Model[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
+    """Derivative of the error after one time step with respect to the error before it."""
+    after = model.predict(mean, dt)
+
+    def error(delta: Array) -> Array:
+        return model.local(after, model.predict(model.retract(mean, delta), dt))
+
+    noise = model.process_noise(mean, dt)
+    return jax.jacfwd(error)(jnp.zeros(noise.shape[0], noise.dtype))
+
+
+def information(
+    model: Model[Mean],
+    mean: Mean,
+    items: PyTree[Array],
+    weights: Float[Array, " n"],
+) -> tuple[Float[Array, "d d"], Float[Array, "n d m"]]:
+    """What the items say of the error at `mean`: A = sum w H' D^-1 H, and w H' D^-1 of each.
+
+    `P @ (w H' D^-1)` is an item's share of the gain of an update whose posterior covariance is P. Items of
+    weight zero count nothing.
+    """
+    mask = weights > 0
+    items = _replace_masked(mask, items, 0.0)
+    observed = jax.vmap(lambda item: model.measure(mean, item))(items)
+    d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
+    lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask)
+    A, _ = _normal_equations(lin, weights, jnp.zeros(d, weights.dtype))
+    whitened = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian)
+    return A, jnp.einsum("n,nid,nij->ndj", weights, whitened, lin.whitener)
+
+
 def predict(model: Model[Mean], belief: Belief[Mean], dt: Float[Array, ""] | float = 1.0) -> Belief[Mean]:
     """The belief one time step later."""
     P = belief.covariance
     dt = jnp.asarray(dt, P.dtype)
-    mean = model.predict(belief.mean, dt)
-
-    def error(delta: Array) -> Array:
-        return model.local(mean, model.predict(model.retract(belief.mean, delta), dt))
-
-    F = jax.jacfwd(error)(jnp.zeros(P.shape[0], P.dtype))
-    return Belief(mean, F @ P @ F.T + model.process_noise(belief.mean, dt))
+    F = transition(model, belief.mean, dt)
+    return Belief(model.predict(belief.mean, dt), F @ P @ F.T + model.process_noise(belief.mean, dt))
 
 
 def update(

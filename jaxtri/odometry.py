@@ -27,7 +27,6 @@ from jaxtri.bases import (
 )
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.geometry.camera import Camera
-from jaxtri.geometry.pose import compose
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.trajectory import Trajectory
 from jaxtri.two_view import TwoView
@@ -232,21 +231,12 @@ class Odometry:
         if again:
             held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
             world = SE3.from_matrix(jnp.asarray(held, pose.translation.dtype))
-            state, _ = fill(
-                self._settings,
-                frames[:1] + frames[-1:],
-                compose(pose.rotation, pose.translation),
-                world,
-                [1.0],
-            )
+            state, _ = fill(self._settings, [first, last], pose, world, [1.0])
             pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
             self.scale_unknown_from = self.scale_unknown_from or first.index
         else:
             self.base_pair = (first.index, last.index)
-        relative = compose(pose.rotation, pose.translation)
-        state, reports = fill(
-            self._settings, frames, relative, world, [self._dt(f.index) for f in frames[1:]]
-        )
+        state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
         self._record(first, world, None, Status.RESTARTED if again else Status.TRACKING)
         for frame, report in [*reports, *self._backwards(first, state, world)]:
             self._record(frame, report.pose, report)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import adjoint, compose
+from jaxtri.geometry.pose import adjoint, compose, shear
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
 from jaxtri.tracker import Report, Settings, judge, median
 from jaxtri.two_view import TwoView
@@ -69,7 +69,7 @@ def init(
     depth = median(1 / jnp.where(inverse > 0, inverse, 1.0), mask & (inverse > 0))
     belief = start(two_view, frames=frames, velocity_sd=0.05 * depth, angular_velocity_sd=0.05)
     inside = mask & informative(belief.mean, pairs, settings.sigma, 2.0)
-    return State(belief, pairs, inside, placement, T, depth, jnp.asarray(0))
+    return State(belief, pairs, inside, placement, T, depth, jnp.asarray(0, jnp.int32))
 
 
 def world_pose(state: State) -> tuple[SE3, Float[Array, "6 6"]]:
@@ -86,20 +86,8 @@ def world_pose(state: State) -> tuple[SE3, Float[Array, "6 6"]]:
 def own_covariance(state: State) -> Float[Array, "6 6"]:
     """Covariance of the current pose within its segment, as a left perturbation (linear, angular)."""
     rows = jnp.array([0, 1, 2, 6, 7, 8])
-    J = _shear(state.belief.mean.motion.translation, 1.0)
+    J = shear(state.belief.mean.motion.translation)
     return J @ state.belief.covariance[rows][:, rows] @ J.T
-
-
-def additive(covariance: Float[Array, "6 6"], T: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """The covariance of a left perturbation as one of errors (T, R): a sum in T, `exp(delta) R` in R."""
-    J = _shear(T, -1.0)
-    return J @ covariance @ J.T
-
-
-def _shear(T: Float[Array, "3"], sign: float) -> Float[Array, "6 6"]:
-    # exp(xi) of a pose also turns its T: rho = delta_T + T x theta.
-    eye, zero = jnp.eye(3, dtype=T.dtype), jnp.zeros((3, 3), T.dtype)
-    return jnp.block([[eye, sign * jnp.cross(T, eye).T], [zero, eye]])
 
 
 def place(pose: Float[Array, "6 6"], log_scale: Float[Array, ""]) -> Float[Array, "7 7"]:

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtri import ekf
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
-from jaxtri.models.base_pairs import BasePairs, BasePoint, base_point
+from jaxtri.keyframes import Keyframes, add, carry, start, total
+from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_point
 from jaxtri.models.motion import Twist
 
 
@@ -83,8 +84,9 @@ class Tracks(NamedTuple):
     """What is known of the track in each slot."""
 
     first: Float[Array, "n 2"]  # observation in its first base frame
-    keyframe: Int[Array, " n"]  # keyframe slot of the first base frame; -1: none yet
+    slots: Int[Array, "n 2"]  # keyframes of its two base frames; -1: none yet, or no longer kept
     base: BasePoint  # (n, 4), (n, 4, 4)
+    lever: Float[Array, "n 4 12"]  # derivative of the point with respect to the errors of the two base poses
     usable: Bool[Array, " n"]  # `base` may measure
     fixed: Bool[Array, " n"]  # `base` stays
 
@@ -94,8 +96,8 @@ class State(NamedTuple):
 
     belief: ekf.Belief[Twist]
     tracks: Tracks
-    keyframes: SE3  # (k,) world to camera; the newest overwrites the oldest
-    made: Int[Array, ""]  # keyframes made so far
+    keyframes: Keyframes
+    sensitivity: Float[Array, "12 s"]  # of the error of `belief` to the s = 6k of the keyframes
     seen: Float[Array, "n 2"]  # observations of the last keyframe
     held: Bool[Array, " n"]  # tracks unbroken since then
     depth: Float[Array, ""]  # median depth of the scene
@@ -106,7 +108,7 @@ class Report(NamedTuple):
     """What a step says of its frame."""
 
     pose: SE3  # world to camera
-    covariance: Float[Array, "6 6"]  # of its error exp(delta) T: (linear, angular) in camera axes
+    covariance: Float[Array, "6 6"]  # of its error exp(delta) T, (linear, angular) in camera axes, drift included
     status: Int[Array, ""]
     keyframe: Bool[Array, ""]
     drop: Bool[Array, " n"]  # tracks that are outliers: their slots may be filled anew
@@ -123,13 +125,15 @@ def init(
     second: Float[Array, "n 2"],
     mask: Bool[Array, " n"],
     pose: SE3,
+    covariance: Float[Array, "6 6"] | None = None,
     *,
     world: SE3 | None = None,
     keyframes: int = 32,
 ) -> State:
     """The state at the first of two base frames whose relative pose X2 = pose X1 is known.
 
-    `mask` marks the slots seen in both. `world` is the pose of the first frame (the identity by default).
+    `mask` marks the slots seen in both. `covariance` is that of the left perturbation of `pose`, zero by
+    default. `world` is the pose of the first frame (the identity by default).
     The frames between the two, and the second, follow by `step` with `hold=True`.
     """
     dtype = first.dtype
@@ -138,19 +142,19 @@ def init(
     two = pose @ one
     first = jnp.where(mask[:, None], first, jnp.zeros((), dtype))
     second = jnp.where(mask[:, None], second, jnp.zeros((), dtype))
-    base, good, _ = jax.vmap(lambda a, b: _pair(settings, a, b, one, two))(first, second)
+    base, lever, good, _ = jax.vmap(lambda a, b: _pair(settings, a, b, one, two))(first, second)
     good &= mask
     depth = median(1 / jnp.where(good, base.point[:, 3], 1.0), good)
-    empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (keyframes, *x.shape)), SE3.identity())
-    frames = jax.tree.map(lambda e, a, b: e.astype(dtype).at[0].set(a).at[1].set(b), empty, one, two)
+    kept = start(one, two, jnp.zeros((6, 6), dtype) if covariance is None else covariance, keyframes)
     # The first pose is the gauge; the velocity is all but unknown.
     sd = jnp.repeat(
         jnp.stack([1e-6 * depth, jnp.asarray(1e-6, dtype), 0.05 * depth, jnp.asarray(0.05, dtype)]), 3
     )
     belief = ekf.Belief(Twist(one, jnp.zeros(6, dtype)), jnp.diag(sd**2))
-    tracks = Tracks(first, jnp.where(mask, 0, -1), base, good, good)
-    made = jnp.asarray(2)
-    return State(belief, tracks, frames, made, second, mask, depth, jnp.asarray(0))
+    slots = jnp.stack([jnp.where(mask, 0, -1), jnp.where(good, 1, -1)], axis=-1).astype(jnp.int32)
+    tracks = Tracks(first, slots, base, lever, good, good)
+    sensitivity = jnp.zeros((12, 6 * keyframes), dtype)
+    return State(belief, tracks, kept, sensitivity, second, mask, depth, jnp.asarray(0, jnp.int32))
 
 
 def judge(
@@ -171,9 +175,9 @@ def judge(
     ok = agreeing & jnp.all(finite)
     belief = jax.tree.map(lambda a, b: jnp.where(ok, a, b), updated, predicted)
     coasted = jnp.where(ok, 0, coasted + 1)
-    status = jnp.where(
-        ok, Status.TRACKING, jnp.where(coasted > settings.patience, Status.LOST, Status.COASTING)
-    )
+    # Tracks do not come back: with too few of them left no later frame can agree either.
+    lost = (coasted > settings.patience) | (count < settings.minimum)
+    status = jnp.where(ok, Status.TRACKING, jnp.where(lost, Status.LOST, Status.COASTING)).astype(jnp.int32)
     return belief, ok, coasted, status
 
 
@@ -186,29 +190,27 @@ def median(x: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
 
 def _pair(
     settings: Settings, first: Float[Array, "2"], second: Float[Array, "2"], one: SE3, two: SE3
-) -> tuple[BasePoint, Bool[Array, ""], Float[Array, ""]]:
-    """The base point of a pair, whether the two views agree on it, and its parallax in radians."""
+) -> tuple[BasePoint, Float[Array, "4 12"], Bool[Array, ""], Float[Array, ""]]:
+    """The base point of a pair, its lever, whether the two views agree on it, and its parallax in radians."""
     relative = two @ one.inverse()
     R, T = relative.rotation().as_matrix(), relative.translation()
     angle = parallax(first, second, R)
     distance = sampson(essential(R, T), first, second)
     ahead = inverse_depth(first, second, R, T, T) > 0
     good = ahead & (jnp.abs(distance) < settings.epipolar_gate)
-    return base_point(first, second, one, two), good, angle
+    return base_point(first, second, one, two), base_lever(first, second, one, two), good, angle
 
 
-def _rebase(
-    settings: Settings, state: State, pose: SE3, observed: Array, visible: Array
-) -> tuple[Tracks, SE3]:
-    """A new keyframe: new tracks get their first base frame, waiting ones their second."""
-    tracks = state.tracks
-    slot = state.made % state.keyframes.wxyz_xyz.shape[0]
-    frames = jax.tree.map(lambda all_, p: all_.at[slot].set(p), state.keyframes, pose)
-    # A waiting track whose first base frame has just been overwritten starts again from here.
-    keyframe = jnp.where((tracks.keyframe == slot) & ~tracks.fixed, -1, tracks.keyframe)
-    waiting = visible & (keyframe >= 0) & ~tracks.fixed
-    ones = jax.tree.map(lambda all_: all_[jnp.maximum(keyframe, 0)], frames)
-    base, good, angle = jax.vmap(lambda a, b, one: _pair(settings, a, b, one, pose))(
+def _rebase(settings: Settings, state: State, observed: Array, visible: Array) -> State:
+    """The state with a keyframe at its pose: new tracks get their first base frame, waiting ones their second."""
+    tracks, belief = state.tracks, state.belief
+    slot, pose = state.keyframes.slot, belief.mean.pose
+    keyframes, sensitivity = add(state.keyframes, pose, belief.covariance[:6, :6], state.sensitivity)
+    # A waiting track whose first base frame is overwritten starts again; a fixed one stands on its point alone.
+    slots = jnp.where(tracks.slots == slot, -1, tracks.slots)
+    waiting = visible & (slots[:, 0] >= 0) & ~tracks.fixed
+    ones = jax.tree.map(lambda all_: all_[jnp.maximum(slots[:, 0], 0)], keyframes.poses)
+    base, lever, good, angle = jax.vmap(lambda a, b, one: _pair(settings, a, b, one, pose))(
         tracks.first, observed, ones
     )
     better = waiting & good & (angle > settings.usable_parallax)
@@ -216,17 +218,16 @@ def _rebase(
     def choose(new: Array, old: Array) -> Array:
         return jnp.where(better.reshape(-1, *([1] * (new.ndim - 1))), new, old)
 
-    begins = visible & (keyframe < 0)
-    return (
-        Tracks(
-            jnp.where(begins[:, None], observed, tracks.first),
-            jnp.where(begins, slot, keyframe),
-            jax.tree.map(choose, base, tracks.base),
-            tracks.usable | better,
-            tracks.fixed | (better & (angle > settings.fixed_parallax)),
-        ),
-        frames,
+    begins = visible & (slots[:, 0] < 0) & ~tracks.fixed
+    moved = Tracks(
+        jnp.where(begins[:, None], observed, tracks.first),
+        jnp.stack([jnp.where(begins, slot, slots[:, 0]), jnp.where(better, slot, slots[:, 1])], axis=-1),
+        jax.tree.map(choose, base, tracks.base),
+        choose(lever, tracks.lever),
+        tracks.usable & ~begins | better,
+        tracks.fixed | (better & (angle > settings.fixed_parallax)),
     )
+    return state._replace(tracks=moved, keyframes=keyframes, sensitivity=sensitivity, seen=observed, held=visible)
 
 
 def step(
@@ -248,10 +249,7 @@ def step(
     observed = jnp.where(visible[:, None], observed, jnp.zeros((), observed.dtype))
     old = state.tracks
     keep = visible & ~fresh
-    tracks = Tracks(
-        old.first, jnp.where(keep, old.keyframe, -1), old.base, old.usable & keep, old.fixed & keep
-    )
-    held = state.held & keep
+    tracks = _only(old, keep)
 
     model = _model(settings, state.depth)
     predicted = ekf.predict(model, state.belief, dt)
@@ -259,45 +257,40 @@ def step(
     updated, diagnostics = ekf.update(
         model, predicted, tracks.base, observed, mask, passes=settings.passes, robust=settings.robust
     )
+    dt = jnp.asarray(dt, observed.dtype)
     belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, mask, state.coasted)
     drop = ok & mask & (diagnostics.distance > settings.outlier)
+    A, gains = ekf.information(model, belief.mean, tracks.base, jnp.where(ok, diagnostics.weights, 0.0))
+    levers = jax.vmap(lambda item, lever: model.lever(belief.mean, item, lever))(tracks.base, tracks.lever)
+    levers = jnp.where(mask[:, None, None], levers, 0.0)
+    F = ekf.transition(model, state.belief.mean, dt)
+    sensitivity = carry(state.sensitivity, F, belief.covariance, A, gains, levers, *tracks.slots.T)
     visible = visible & ~drop
-    tracks = Tracks(
-        tracks.first,
-        jnp.where(drop, -1, tracks.keyframe),
-        tracks.base,
-        tracks.usable & ~drop,
-        tracks.fixed & ~drop,
-    )
-    held &= ~drop
+    tracks = _only(tracks, ~drop)
+    held = state.held & keep & ~drop
 
     flow = median(jnp.sqrt(jnp.sum((observed - state.seen) ** 2, axis=-1)), held)
     live = jnp.sum(visible).astype(observed.dtype)
-    usable = jnp.sum(tracks.usable & visible).astype(observed.dtype)
+    usable = jnp.sum(tracks.usable).astype(observed.dtype)
     due = (flow > settings.keyframe_flow) | (jnp.sum(held) < settings.keyframe_common)
     due |= usable < settings.keyframe_usable * live
     keyframe = due & ok & ~jnp.asarray(hold)
 
-    interim = state._replace(tracks=tracks)
-    rebased, frames = _rebase(settings, interim, belief.mean.pose, observed, visible)
-    pick = lambda new, before: jax.tree.map(lambda a, b: jnp.where(keyframe, a, b), new, before)  # noqa: E731
-    depths = belief.mean.pose.rotation().as_matrix()[2] @ tracks.base.point[:, :3].T
-    depths = depths + belief.mean.pose.translation()[2] * tracks.base.point[:, 3]
     inverse = tracks.base.point[:, 3]
-    depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9)
+    depths = tracks.base.point[:, :3] @ belief.mean.pose.rotation().as_matrix()[2]
+    depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
-    new = State(
-        belief=belief,
-        tracks=pick(rebased, tracks),
-        keyframes=pick(frames, state.keyframes),
-        made=state.made + keyframe,
-        seen=pick(observed, state.seen),
-        held=pick(visible, held),
-        depth=depth,
-        coasted=coasted,
-    )
-    report = Report(belief.mean.pose, belief.covariance[:6, :6], status, keyframe, drop, diagnostics)
-    return new, report
+    plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, coasted)
+    rebased = _rebase(settings, plain, observed, visible)
+    new = jax.tree.map(lambda a, b: jnp.where(keyframe, a, b), rebased, plain)
+    covariance = total(belief.covariance[:6, :6], state.keyframes, sensitivity)
+    return new, Report(belief.mean.pose, covariance, status, keyframe, drop, diagnostics)
+
+
+def _only(tracks: Tracks, keep: Bool[Array, " n"]) -> Tracks:
+    """The tracks with all others forgotten."""
+    slots = jnp.where(keep[:, None], tracks.slots, -1)
+    return tracks._replace(slots=slots, usable=tracks.usable & keep, fixed=tracks.fixed & keep)
 
 
 def filter(

@@ -7,14 +7,15 @@ os.environ.setdefault("MPLBACKEND", "agg")
 
 from jaxtyping import install_import_hook
 
-with install_import_hook("jaxtri", "beartype.beartype"):
+# The numeric tower: an int may stand where a float is asked for, as Python has it.
+with install_import_hook("jaxtri", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"):
     import jaxtri  # noqa: F401
 
 import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_dtype_promotion", "strict")
+# Strict promotion is not to be had: jaxlie multiplies its integer tables with floats.
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ class BrownConrady(eqx.Module):
     coefficients: Float[Array, "8"]
 
     @classmethod
-    def from_coefficients(cls, coefficients: Sequence[float], dtype: Any = None) -> Self:
+    def from_coefficients(cls, coefficients: Sequence[float], dtype: Any = None) -> "BrownConrady":
         """Pad a shorter list with zeros. Raises `CameraError` for prism or tilt terms (ninth and on)."""
         if any(c != 0 for c in coefficients[8:]):
             raise CameraError(
@@ -61,7 +61,7 @@ class Fisheye(eqx.Module):
     coefficients: Float[Array, "4"]
 
     @classmethod
-    def from_coefficients(cls, coefficients: Sequence[float], dtype: Any = None) -> Self:
+    def from_coefficients(cls, coefficients: Sequence[float], dtype: Any = None) -> "Fisheye":
         """Pad a shorter list with zeros. Raises `CameraError` for more than four."""
         return cls(_coefficients(coefficients, 4, dtype))
 
@@ -148,7 +148,7 @@ class Camera(eqx.Module):
         width: int | None = None,
         height: int | None = None,
         dtype: Any = None,
-    ) -> Self:
+    ) -> "Camera":
         """A camera from numbers, checked; `dtype` defaults to JAX's default float.
 
         Raises `CameraError` naming the parameter that is not finite, or not positive where it must be.
@@ -167,7 +167,7 @@ class Camera(eqx.Module):
         return cls(fx_, fy_, cx_, cy_, skew_, distortion, width, height).astype(dtype)
 
     @classmethod
-    def from_fov(cls, fov_deg: float, width: int, height: int, dtype: Any = None) -> Self:
+    def from_fov(cls, fov_deg: float, width: int, height: int, dtype: Any = None) -> "Camera":
         """A camera of square pixels with the given horizontal field of view (degrees), centred.
 
         The field reaches from the left edge of the first pixel to the right edge of the last.
@@ -178,7 +178,7 @@ class Camera(eqx.Module):
         cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
         return cls.from_parameters(f, f, cx, cy, width=width, height=height, dtype=dtype)
 
-    def astype(self, dtype: Any) -> Self:
+    def astype(self, dtype: Any) -> "Camera":
         """The same camera with all its leaves in another float type."""
         return jax.tree.map(lambda leaf: leaf.astype(dtype), self)
 

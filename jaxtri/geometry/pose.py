@@ -127,3 +127,12 @@ def rotation_matrix(rotation: SO3 | Float[Array, "3"]) -> Float[Array, "3 3"]:
 def compose(rotation: SO3, translation: Float[Array, "3"]) -> SE3:
     """The pose of a rotation and a translation."""
     return SE3.from_rotation_and_translation(rotation, translation)
+
+
+def shear(T: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """Takes errors (T, R), a sum in T and `exp(delta) R` in R, to the left perturbation of the pose.
+
+    exp(xi) of a pose also turns its T: rho = delta_T + T x delta_R. Its inverse is `shear(-T)`.
+    """
+    eye, zero = jnp.eye(3, dtype=T.dtype), jnp.zeros((3, 3), T.dtype)
+    return jnp.block([[eye, jnp.cross(T, eye).T], [zero, eye]])

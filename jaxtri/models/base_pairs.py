@@ -36,6 +36,17 @@ def base_point(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, 
     return BasePoint(point(pair), jax.jacfwd(point)(pair))
 
 
+def base_lever(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, pose2: SE3) -> Float[Array, "4 12"]:
+    """Derivative of the base point with respect to the errors of the two base poses (left perturbations)."""
+
+    def point(errors: Array) -> Array:
+        one, two = retract(pose1, errors[:6]), retract(pose2, errors[6:])
+        R1, R2 = one.rotation().as_matrix(), two.rotation().as_matrix()
+        return point_from_bases(first, second, R1, one.translation(), R2, two.translation())
+
+    return jax.jacfwd(point)(jnp.zeros(12, first.dtype))
+
+
 class BasePairs(eqx.Module):
     """Model of `jaxtri.ekf` for a camera on SE(3) whose items are `BasePoint`s; every field is a leaf."""
 
@@ -65,6 +76,10 @@ class BasePairs(eqx.Module):
     def measure(self, mean: Twist, item: BasePoint) -> Float[Array, "2"]:
         """The transferred point, normalised."""
         return self._project(mean, item.point)
+
+    def lever(self, mean: Twist, item: BasePoint, lever: Float[Array, "4 12"]) -> Float[Array, "2 12"]:
+        """Derivative of the transferred point with respect to the errors of its base poses."""
+        return jax.jacfwd(lambda X: self._project(mean, X))(item.point) @ lever
 
     def noise(self, mean: Twist, item: BasePoint) -> Float[Array, "2 2"]:
         """sigma^2 (I + J J'), J the derivative of the transfer with respect to the two base observations."""

@@ -1,0 +1,87 @@
+"""Keyframes: base frames whose poses are kept, and what their errors do to every later pose.
+
+The filter measures as if the base poses were exact, which is what makes it O(N); their errors are not
+forgotten, though. They are consider parameters (Schmidt 1966): the error of the current pose is its own, of
+the covariance the filter reports, plus a linear function of the keyframes' errors, the `sensitivity`. So the
+drift of a long sequence, its scale included, stands in the covariance of every pose.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Float, Int
+
+
+class Keyframes(NamedTuple):
+    """A ring of k poses, the newest overwriting the oldest, with the joint covariance of their errors."""
+
+    poses: SE3  # (k,) world to camera
+    made: Int[Array, ""]  # how many were made so far
+    covariance: Float[Array, "s s"]  # s = 6k; left perturbations (linear, angular), each in its own camera axes
+
+    @property
+    def slot(self) -> Int[Array, ""]:
+        """Where the next one goes."""
+        return self.made % self.poses.wxyz_xyz.shape[0]
+
+
+def start(one: SE3, two: SE3, covariance: Float[Array, "6 6"], k: int) -> Keyframes:
+    """The first two keyframes: `one` is the gauge, `two` has the given covariance relative to it."""
+    dtype = covariance.dtype
+    empty = jax.tree.map(lambda x: jnp.broadcast_to(x.astype(dtype), (k, *x.shape)), SE3.identity())
+    poses = jax.tree.map(lambda e, a, b: e.at[0].set(a).at[1].set(b), empty, one, two)
+    joint = jnp.zeros((6 * k, 6 * k), dtype).at[6:12, 6:12].set(covariance)
+    return Keyframes(poses, jnp.asarray(2, jnp.int32), joint)
+
+
+def add(
+    keyframes: Keyframes, pose: SE3, own: Float[Array, "6 6"], sensitivity: Float[Array, "d s"]
+) -> tuple[Keyframes, Float[Array, "d s"]]:
+    """A new keyframe at the current pose, whose own covariance and sensitivity (first six rows) are given.
+
+    The sensitivity comes back without the keyframe that was overwritten, whose influence is dropped.
+    """
+    slot = keyframes.slot
+    rows = 6 * slot + jnp.arange(6)
+    poses = jax.tree.map(lambda all_, p: all_.at[slot].set(p), keyframes.poses, pose)
+    sensitivity = sensitivity.at[:, rows].set(0.0)
+    B, S = sensitivity[:6], keyframes.covariance.at[rows].set(0.0).at[:, rows].set(0.0)
+    cross = B @ S
+    S = S.at[rows].set(cross).at[:, rows].set(cross.T)
+    S = S.at[rows[:, None], rows].set(own + cross @ B.T)
+    return Keyframes(poses, keyframes.made + 1, S), sensitivity
+
+
+def carry(
+    sensitivity: Float[Array, "d s"],
+    transition: Float[Array, "d d"],
+    covariance: Float[Array, "d d"],
+    information: Float[Array, "d d"],
+    gains: Float[Array, "n d m"],
+    levers: Float[Array, "n m 12"],
+    first: Int[Array, " n"],
+    second: Int[Array, " n"],
+) -> Float[Array, "d s"]:
+    """The sensitivity after a prediction and an update.
+
+    `covariance` is the posterior P, `information` A and `gains` are those of `ekf.information`, `levers` the
+    derivatives of the measurements with respect to the errors of the two base frames in the slots `first`
+    and `second` (-1: one no longer kept): B <- (I - P A) F B - P sum w H' D^-1 J.
+    """
+    d, k = sensitivity.shape[0], sensitivity.shape[1] // 6
+    moved = transition @ sensitivity
+    blocks = gains @ levers
+    pull = jnp.zeros((k, d, 6), sensitivity.dtype)
+    for slots, part in ((first, blocks[..., :6]), (second, blocks[..., 6:])):
+        kept = jnp.where((slots >= 0)[:, None, None], part, 0.0)
+        pull = pull.at[jnp.maximum(slots, 0)].add(kept)
+    flat = jnp.moveaxis(pull, 0, 1).reshape(d, 6 * k)
+    return moved - covariance @ (information @ moved + flat)
+
+
+def total(own: Float[Array, "6 6"], keyframes: Keyframes, sensitivity: Float[Array, "d s"]) -> Float[Array, "6 6"]:
+    """Covariance of the current pose, its own and what it owes to the keyframes."""
+    B = sensitivity[:6]
+    return own + B @ keyframes.covariance @ B.T

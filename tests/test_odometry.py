@@ -1,0 +1,182 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from tracks import CAPACITY, make, sideways
+
+from jaxtri import bases
+from jaxtri.bases import Base, StartSettings
+from jaxtri.errors import InitialisationError, InputError
+from jaxtri.odometry import Odometry
+from jaxtri.pipeline import follow_tracks
+from jaxtri.tracker import Status
+from jaxtri.trajectory import Trajectory, evaluate
+
+
+def errors(tracks, odometry):
+    times = np.arange(len(tracks.R), dtype=float)
+    return evaluate(odometry.trajectory(), Trajectory(times, tracks.T_world_camera))
+
+
+@pytest.mark.parametrize("base", list(Base))
+def test_every_kind_of_base_recovers_the_trajectory(base):
+    tracks = sideways(40)
+    odometry = follow_tracks(tracks.camera, tracks.pixels, tracks.visible, base=base)
+    found = errors(tracks, odometry)
+    # 0.3 px at 500 px and 4 m deep is 2.4 mm; the path is 1.2 m. Consecutive base frames see 0.4 degrees.
+    limit = {Base.TRACKS: 0.6, Base.INHERIT: 0.6, Base.PAPER: 3.0}[base]
+    assert found.ate_percent < limit
+    assert found.rotation_rmse_deg < limit / 2
+    assert [p.status for p in odometry.poses] == [Status.TRACKING] * 40
+    assert odometry.segments == 1
+    assert odometry.scale_unknown_from is None
+
+
+def test_single_pairs_restart_and_keep_the_scale():
+    t = np.arange(70)[:, None]
+    # Points leave on one side, and every new pair has but what is left: a long way past a long wall.
+    tracks = make(t * [0.05, 0.0, 0.0], 0 * t * [0.0, 0.0, 0.0], depth=3.0)
+    rng = np.random.default_rng(1)
+    pixels, visible = tracks.pixels.copy(), tracks.visible.copy()
+    # New tracks are born in the slots of those that left, from points further along the wall.
+    fresh_points = rng.uniform([0, -1.2, 2], [5, 1.2, 4.2], (CAPACITY, 3))
+    ids = np.tile(np.arange(CAPACITY), (70, 1))
+    for n, X in enumerate(fresh_points):
+        gone = np.flatnonzero(~visible[:, n])
+        x = (X - tracks.centres) / X[2]
+        u = np.c_[500 * x[:, 0] + 320, 500 * x[:, 1] + 240]
+        inside = (u > 0).all(1) & (u < [640, 480]).all(1)
+        again = np.flatnonzero(inside & (np.arange(70) >= (gone[0] if gone.size else 70)))
+        pixels[again, n] = u[again] + rng.normal(scale=0.3, size=(again.size, 2))
+        visible[again, n] = True
+        ids[again, n] += CAPACITY
+    for base in (Base.INHERIT, Base.PAPER):
+        odometry = Odometry(tracks.camera, base=base)
+        before = np.full(CAPACITY, -1)
+        for k in range(70):
+            fresh = visible[k] & (ids[k] != before)
+            before = np.where(visible[k], ids[k], -1)
+            odometry.add(bases_tracks(pixels[k], visible[k], fresh, ids[k]), float(k))
+        assert odometry.changes >= 1
+        assert odometry.segments == 1
+        found = errors(tracks, odometry)
+        assert found.ate_percent < 3
+
+
+def bases_tracks(pixels, visible, fresh, ids):
+    from jaxtri.vision.klt import FrameTracks
+
+    return FrameTracks(pixels, visible, fresh, ids, np.zeros(len(ids)))
+
+
+def test_frames_before_the_first_motion_are_filled_in():
+    tracks = make(np.maximum(np.arange(30) - 10, 0)[:, None] * [0.04, 0, 0], np.zeros((30, 3)))
+    odometry = follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
+    assert all(p.status is Status.TRACKING for p in odometry.poses)
+    assert errors(tracks, odometry).ate_percent < 0.3
+
+
+def test_a_plane_starts_with_the_right_one_of_its_two_poses():
+    for seed in range(3):
+        tracks = sideways(25, plane=True, seed=seed)
+        found = errors(tracks, follow_tracks(tracks.camera, tracks.pixels, tracks.visible))
+        assert found.rotation_rmse_deg < 0.3
+        assert found.ate_percent < 2
+
+
+@pytest.mark.parametrize("case", ["static", "rotation"])
+def test_no_parallax_waits_and_says_so(case):
+    t = np.arange(30)[:, None]
+    turns = {"static": 0 * t * np.zeros(3), "rotation": t * [0.0, 0.01, 0.003]}[case]
+    tracks = make(np.zeros((30, 3)), turns)
+    odometry = follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
+    assert all(p.status is Status.INITIALISING for p in odometry.poses)
+    with pytest.raises(InitialisationError, match={"static": "flow", "rotation": "parallax"}[case]):
+        odometry.trajectory()
+
+
+def test_too_few_points_wait():
+    tracks = sideways(20)
+    visible = tracks.visible.copy()
+    visible[:, 6:] = False
+    odometry = follow_tracks(tracks.camera, tracks.pixels, visible)
+    with pytest.raises(InitialisationError, match="features|tracks"):
+        odometry.trajectory()
+
+
+def test_what_stands_in_masked_tracks_changes_nothing():
+    tracks = sideways(20)
+    visible = tracks.visible & (np.random.default_rng(3).random(tracks.visible.shape[1]) < 0.9)
+    clean = follow_tracks(tracks.camera, tracks.pixels, visible).trajectory()
+    for value in (np.nan, 1e30):
+        dirty = np.where(visible[..., None], tracks.pixels, value)
+        found = follow_tracks(tracks.camera, dirty, visible).trajectory()
+        np.testing.assert_array_equal(found.T_world_camera, clean.T_world_camera)
+        np.testing.assert_array_equal(found.covariance, clean.covariance)
+    # A NaN that claims to be visible is as good as unseen.
+    claimed = follow_tracks(tracks.camera, np.where(visible[..., None], tracks.pixels, np.nan), visible | True)
+    np.testing.assert_array_equal(claimed.trajectory().T_world_camera, clean.T_world_camera)
+
+
+def test_a_complete_loss_starts_anew_and_says_that_the_scale_is_unknown():
+    first, second = sideways(20), sideways(45, seed=5)
+    pixels = np.concatenate([first.pixels, second.pixels])
+    visible = np.concatenate([first.visible, second.visible])
+    visible[20:24] = False  # the lens is covered for a while
+    ids = np.repeat(np.arange(2), [20, 45])[:, None] * CAPACITY + np.arange(CAPACITY)
+    odometry = Odometry(first.camera)
+    before = np.full(CAPACITY, -1)
+    for k in range(65):
+        fresh = visible[k] & (ids[k] != before)
+        before = np.where(visible[k], ids[k], -1)
+        odometry.add(bases_tracks(pixels[k], visible[k], fresh, ids[k]), float(k))
+    status = [p.status for p in odometry.poses]
+    assert status[:20] == [Status.TRACKING] * 20
+    assert status[20:24] == [Status.LOST] * 4
+    assert status[24] is Status.RESTARTED
+    assert status[25:] == [Status.TRACKING] * 40
+    assert odometry.segments == 2
+    assert odometry.scale_unknown_from == 24
+    assert np.isfinite(odometry.trajectory().T_world_camera).all()
+
+
+def test_frames_that_make_no_sense_are_coasted_over():
+    tracks = sideways(40)
+    pixels = tracks.pixels.copy()
+    pixels[25:28] = np.random.default_rng(0).uniform([0, 0], [640, 480], pixels[25:28].shape)
+    odometry = follow_tracks(tracks.camera, pixels, tracks.visible)
+    status = [p.status for p in odometry.poses]
+    assert status[25:28] == [Status.COASTING] * 3
+    assert status[:25] + status[28:] == [Status.TRACKING] * 37
+    sd = np.sqrt([np.trace(p.covariance) for p in odometry.poses])
+    assert sd[27] > 2 * sd[24]
+    assert sd[28] < 2 * sd[24]
+    assert errors(tracks, odometry).ate_percent < 2
+
+
+def test_a_changing_number_of_features_never_recompiles():
+    tracks = sideways(30)
+    follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
+    compiled = bases._step._cache_size()
+    rng = np.random.default_rng(0)
+    visible = np.logical_and.accumulate(tracks.visible & (rng.random(tracks.visible.shape) < 0.97), axis=0)
+    follow_tracks(tracks.camera, tracks.pixels, visible)
+    assert bases._step._cache_size() == compiled
+
+
+def test_the_paper_start_overlaps_as_asked():
+    tracks = sideways(30)
+    start = dataclasses.replace(StartSettings.of(Base.PAPER), restart=0.97, overlap=3)
+    odometry = follow_tracks(tracks.camera, tracks.pixels, tracks.visible, base=Base.PAPER, start=start)
+    assert odometry.changes >= 1
+    assert errors(tracks, odometry).ate_percent < 5
+
+
+def test_wrong_input_is_named():
+    tracks = sideways(3)
+    with pytest.raises(InputError, match="does not follow"):
+        follow_tracks(tracks.camera, tracks.pixels, tracks.visible, np.array([0.0, 1.0, 1.0]))
+    with pytest.raises(InputError, match=r"\(t, n, 2\)"):
+        follow_tracks(tracks.camera, tracks.pixels[..., 0], tracks.visible)
+    with pytest.raises(InputError, match="width"):
+        Odometry(dataclasses.replace(tracks.camera, width=None))
