@@ -1,19 +1,15 @@
 """The command line: `jaxtri track`, `jaxtri evaluate`, `jaxtri demo`."""
 
-import importlib.metadata
-import platform
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from jaxtri.errors import CameraError, InputError, JaxtriError, TruncatedVideoWarning
-
-PACKAGES = ("jaxtri", "jax", "equinox", "optimistix", "jaxlie", "numpy", "opencv-python-headless")
 
 
 @dataclass
@@ -108,5 +104,149 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
         print(f"jaxtri: warning: {message}", file=sys.stderr)
 
 
-def _versions() -> dict[str, str]:
-    return {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in PACKAGES}
+
+def _track(options: Track) -> None:
+    from jaxtri.results import write_overlay, write_results
+    from jaxtri.vision.video import open_source
+
+    base = _base(options.base)
+    live = options.source.isdecimal() and not Path(options.source).exists()
+    if live and options.max_frames is None:
+        print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
+    with open_source(options.source, fps=options.fps, strict=options.strict) as source:
+        camera = _camera(options, source.size)
+        frames: Any = _spooled(source, options.out / "frames") if live else source
+        run = _run(frames, camera, base, options)
+        fps = source.fps
+    paths = write_results(run, options.out, {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()})
+    if options.overlay:
+        again = options.out / "frames" if live else options.source
+        with warnings.catch_warnings(), open_source(again, fps=options.fps) as source:
+            warnings.simplefilter("ignore", TruncatedVideoWarning)  # said once already
+            try:
+                overlay = options.out / "overlay.mp4"
+                paths.append(
+                    write_overlay(run, source, camera, overlay, fps, at=options.place, progress=not options.quiet)
+                )
+            except InputError as error:
+                if options.place is not None:
+                    raise
+                print(f"jaxtri: warning: no overlay: {error}", file=sys.stderr)
+    _summarise(run, paths)
+
+
+def _base(name: str) -> Any:
+    from jaxtri.bases import Base
+
+    try:
+        return Base(name)
+    except ValueError:
+        raise InputError(f"--base {name}: choose one of {', '.join(b.value for b in Base)}") from None
+
+
+def _camera(options: Track, size: tuple[int, int]) -> Any:
+    from jaxtri.geometry.camera import Camera
+    from jaxtri.io import read_camera
+
+    if (options.camera is None) == (options.fov is None):
+        raise CameraError("give the intrinsics: --camera FILE, or a guess of the field of view by --fov DEGREES")
+    if options.camera is not None:
+        return read_camera(options.camera, width=size[0], height=size[1])
+    return Camera.from_fov(options.fov, *size)
+
+
+def _run(frames: Any, camera: Any, base: Any, options: Track) -> Any:
+    from jaxtri.bases import StartSettings
+    from jaxtri.pipeline import track
+    from jaxtri.tracker import Settings
+    from jaxtri.vision.klt import KLTSettings
+
+    changes = {} if options.min_parallax is None else {"parallax_deg": options.min_parallax}
+    return track(
+        frames,
+        camera,
+        base=base,
+        settings=Settings.of(camera, noise_px=options.noise_px),
+        start=StartSettings.of(base, overlap=options.overlap, **changes),
+        klt=KLTSettings(capacity=options.features),
+        progress=not options.quiet,
+        max_frames=options.max_frames,
+    )
+
+
+def _spooled(frames: Any, folder: Path) -> Iterator[Any]:
+    """The frames of a camera, kept as files on their way: the overlay needs them again."""
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "timestamps.txt", "w") as stamps:
+        for frame in frames:
+            name = f"{frame.index:06d}.jpg"
+            cv2.imwrite(str(folder / name), frame.image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+            stamps.write(f"{frame.time_s:.6f} {name}\n")
+            stamps.flush()
+            yield frame
+
+
+def _summarise(run: Any, paths: list[Path]) -> None:
+    s = run.statistics
+    states = ", ".join(f"{count} {name}" for name, count in s["status"].items())
+    print(f"{s['frames']} frames at {s['frames_per_second']:.0f} a second: {states}")
+    print(f"{s['keyframes']} keyframes, {s['points_used_per_frame']:.0f} points a frame, {len(run.points.ids)} in all")
+    if s["scale_unknown_from_frame"] is not None:
+        print(f"the camera was lost: from frame {s['scale_unknown_from_frame']} on the scale is a guess")
+    if s["interrupted"]:
+        print("interrupted: these are the frames up to there")
+    for path in paths:
+        print(f"  {path}")
+
+
+def _evaluate(options: Evaluate) -> None:
+    from jaxtri.io import read_trajectory, write_json
+    from jaxtri.trajectory import evaluate
+
+    found = evaluate(read_trajectory(options.estimate), read_trajectory(options.groundtruth), with_scale=options.scale)
+    _print_errors(found)
+    if options.json is not None:
+        write_json(options.json, asdict(found))
+
+
+def _print_errors(found: Any) -> None:
+    print(f"{found.matched} frames matched, {found.coverage:.1%} of the reference; scale {found.scale:.6g}")
+    print(f"ATE  {found.ate_rmse:.6g} rmse, {found.ate_percent:.3f} % of the path")
+    print(f"RPE  {found.rpe_translation:.6g} ({found.rpe_translation_percent:.2f} % of the mean step), ", end="")
+    print(f"{found.rpe_rotation_deg:.4f} degrees a frame")
+    print(f"orientation {found.rotation_rmse_deg:.4f} degrees rmse")
+
+
+def _demo(options: Demo) -> None:
+    from jaxtri.io import read_tum
+    from jaxtri.results import write_overlay, write_results
+    from jaxtri.vision.rendered import write_laboratory
+    from jaxtri.trajectory import evaluate
+    from jaxtri.vision.video import open_source
+
+    if options.frames < 2:
+        raise InputError(f"--frames {options.frames}: a camera's motion needs at least two")
+    folder = options.out / "sequence"
+    print(f"rendering {options.frames} frames of a laboratory, the camera sliding sideways before some boxes")
+    camera = write_laboratory(folder, options.frames, options.seed, progress=not options.quiet)
+    truth = read_tum(folder / "groundtruth.txt")
+    track = Track(str(folder), quiet=options.quiet)
+    with open_source(folder) as source:
+        run = _run(source, camera, _base("tracks"), track)
+        fps = source.fps
+    found = evaluate(run.trajectory, truth)
+    run = run.scaled(found.scale)  # the gauge is known here: metres
+    paths = write_results(run, options.out, asdict(options) | {"out": str(options.out)}, reference=truth)
+    with open_source(folder) as source:
+        overlay = options.out / "overlay.mp4"
+        paths.append(write_overlay(run, source, camera, overlay, fps, progress=not options.quiet))
+    _summarise(run, paths)
+    print("errors against the truth, in metres:")
+    _print_errors(found)
+    print(f"look at {options.out / 'trajectory.png'} and {options.out / 'overlay.mp4'}; the frames are in {folder}")
+
+
+if __name__ == "__main__":
+    main()

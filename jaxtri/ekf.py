@@ -113,6 +113,20 @@ def _replace_masked(mask: Bool[Array, " n"], items: PyTree, value: float) -> PyT
     return jax.tree.map(replace, items)
 
 
+def _stand_in(mask: Bool[Array, " n"], items: PyTree) -> PyTree:
+    """Masked items become copies of an unmasked one, or zero where there is none.
+
+    Not zero everywhere: a model may be singular there, and 0 * inf in its gradient would be NaN.
+    """
+    some = jnp.argmax(mask)
+
+    def replace(x: Array) -> Array:
+        one = jnp.where(mask[some], x[some], jnp.zeros((), x.dtype))
+        return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, one)
+
+    return jax.tree.map(replace, items)
+
+
 def _linearise(
     model: Model, prior: Mean, delta: Array, items: PyTree, observed: Array, mask: Array
 ) -> _Linearisation:
@@ -133,7 +147,9 @@ def _linearise(
 
 def _normal_equations(lin: _Linearisation, weights: Array, delta: Array) -> tuple[Array, Array]:
     """A = sum w H' D^-1 H and b = sum w H' D^-1 (r + H delta): all that the items say, in d numbers."""
-    root = jnp.sqrt(weights)[:, None]
+    # Guarded: the square root has no derivative at the zero of a masked item.
+    positive = weights > 0
+    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, weights, 1.0)), 0.0)[:, None]
     H = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian) * root[..., None]
     r = jnp.einsum("nij,nj->ni", lin.whitener, lin.residual) * root
     H, r = H.reshape(-1, H.shape[-1]), r.reshape(-1)
@@ -183,7 +199,7 @@ def information(
     weight zero count nothing.
     """
     mask = weights > 0
-    items = _replace_masked(mask, items, 0.0)
+    items = _stand_in(mask, items)
     observed = jax.vmap(lambda item: model.measure(mean, item))(items)
     d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
     lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask)
@@ -218,7 +234,7 @@ def update(
     """
     P, prior = belief.covariance, belief.mean
     dtype = P.dtype
-    items = _replace_masked(mask, items, 0.0)
+    items = _stand_in(mask, items)
     observed = _replace_masked(mask, observed, 0.0)
     valid = mask.astype(dtype)
 
@@ -310,4 +326,5 @@ def filter(
         carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
         return carry, (carry, diagnostics)
 
-    return jax.lax.scan(body, belief, (observed, mask, dt))[1]
+    # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.
+    return jax.lax.scan(jax.checkpoint(body), belief, (observed, mask, dt))[1]

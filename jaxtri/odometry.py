@@ -4,7 +4,7 @@ The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, a
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax
@@ -47,6 +47,14 @@ class FramePose:
     covariance: np.ndarray | None = None
     used: int = 0
     nis: float = float("nan")
+
+    def scaled(self, scale: float) -> "FramePose":
+        """The pose in other units of length."""
+        if self.T_camera_world is None or self.covariance is None:
+            return self
+        T, s = self.T_camera_world.copy(), np.repeat([scale, 1.0], 3)
+        T[:3, 3] *= scale
+        return replace(self, T_camera_world=T, covariance=self.covariance * np.outer(s, s))
 
 
 _normalise = eqx.filter_jit(lambda camera, pixels: camera.to_normalised(pixels))
@@ -147,7 +155,7 @@ class Odometry:
         R = np.swapaxes(T[:, :3, :3], 1, 2)
         world = np.tile(np.eye(4), (len(T), 1, 1))
         world[:, :3, :3] = R
-        world[:, :3, 3] = -np.einsum("tij,tj->ti", R, T[:, :3, 3])
+        world[:, :3, 3] = 0.0 - np.einsum("tij,tj->ti", R, T[:, :3, 3])
         # exp(xi) T_camera_world moves the centre by -R' rho and turns R_world_camera by exp(-theta) on the right.
         J = np.zeros((len(T), 6, 6))
         J[:, :3, :3] = -R

@@ -3,7 +3,8 @@
 import time
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from tqdm import tqdm
@@ -27,6 +28,18 @@ class Run:
     colours: np.ndarray  # (n, 3) uint8 RGB of the points
     odometry: Odometry
     statistics: dict[str, object] = field(default_factory=dict)
+
+    def scaled(self, scale: float) -> "Run":
+        """The same run in other units of length: trajectory, points and poses multiplied by `scale`."""
+        T = self.trajectory.T_world_camera.copy()
+        T[:, :3, 3] *= scale
+        s = np.repeat([scale, 1.0], 3)
+        C = self.trajectory.covariance
+        trajectory = replace(self.trajectory, T_world_camera=T, covariance=None if C is None else C * np.outer(s, s))
+        points = Points(self.points.ids, self.points.xyz * scale, self.points.covariance * scale**2)
+        odometry = copy(self.odometry)
+        odometry.poses = [p.scaled(scale) for p in self.odometry.poses]
+        return replace(self, trajectory=trajectory, points=points, odometry=odometry)
 
 
 def track(

@@ -1,4 +1,4 @@
-from functools import partial
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -12,8 +12,15 @@ from scipy.stats import multivariate_normal
 from jaxtri import ekf
 from jaxtri.geometry import pose
 
+N = 24  # landmarks, the same number everywhere: one compilation for all tests
+ROBUST = ekf.Robust(*(jnp.asarray(x) for x in (1e4, 16.0, 13.8)))
+
 update = jax.jit(ekf.update, static_argnames="passes")
 filter_ = jax.jit(ekf.filter, static_argnames="passes")
+retract = jax.jit(lambda model, mean, delta: model.retract(mean, jnp.asarray(delta)))
+local = jax.jit(lambda model, mean, other: model.local(mean, other))
+measure = jax.jit(lambda model, mean, items: jax.vmap(model.measure, (None, 0))(mean, items))
+noise = jax.jit(lambda model, mean, items: jax.vmap(model.noise, (None, 0))(mean, items))
 
 
 class Linear(eqx.Module):
@@ -74,54 +81,99 @@ class Sextant(eqx.Module):
         return self.sigma**2 * (a + 0.1 * jnp.outer(X[:2], X[:2]))
 
 
-def sextant(dtype=jnp.float64, sigma=1e-2):
-    model = Sextant(jnp.asarray(sigma), jnp.asarray(0.02), jnp.array([0.01, -0.02, 0.03]))
+class Ranger(eqx.Module):
+    """A vehicle, position and velocity in the plane; an item is a beacon, its measurement the distance to it."""
+
+    sigma: Float[Array, ""]
+    acceleration: Float[Array, ""]
+
+    def retract(self, mean, delta):
+        return mean + delta
+
+    def local(self, mean, other):
+        return other - mean
+
+    def predict(self, mean, dt):
+        return mean + dt * jnp.concatenate([mean[2:], jnp.zeros_like(mean[2:])])
+
+    def process_noise(self, mean, dt):
+        step = jnp.stack([dt**2 / 2, dt])
+        return self.acceleration**2 * jnp.kron(jnp.outer(step, step), jnp.eye(2, dtype=step.dtype))
+
+    def measure(self, mean, item):
+        return jnp.linalg.norm(mean[:2] - item)[None]
+
+    def noise(self, mean, item):
+        return jnp.square(self.sigma * (1 + 0.1 * self.measure(mean, item)))[None]
+
+
+def ranger(frames=2, n=8):
+    """A model, a belief at the origin, beacons, noisy distances and a mask with two in eight missing."""
+    rng = np.random.default_rng(0)
+    model = Ranger(*jnp.array([0.05, 0.1]))
+    belief = ekf.Belief(jnp.zeros(4), jnp.diag(jnp.array([0.1, 0.1, 0.05, 0.05])))
+    beacons = rng.uniform(-3, 3, (n, 2))
+    path = 0.2 + 0.3 * np.arange(frames)[:, None] * np.array([1.0, 0.5])
+    distances = np.linalg.norm(path[:, None] - beacons, axis=-1)
+    observed = distances + 0.05 * rng.normal(size=(frames, n))
+    mask = np.arange(n) % 4 != 1
+    return model, belief, jnp.asarray(beacons), jnp.asarray(observed)[..., None], jnp.asarray(mask)
+
+
+def sextant(dtype=jnp.float64):
+    model = Sextant(jnp.asarray(1e-2), jnp.asarray(0.02), jnp.array([0.01, -0.02, 0.03]))
     mean = {"R": SO3.exp(jnp.array([0.1, -0.2, 0.1])), "T": jnp.array([0.1, 0.2, -0.1])}
     A = np.random.default_rng(0).normal(size=(6, 6))
     belief = ekf.Belief(mean, jnp.asarray(0.02 * (A @ A.T / 6 + np.eye(6))))
     return jax.tree.map(lambda x: x.astype(dtype), (model, belief))
 
 
-def sextant_frames(frames, n=12, seed=0, noise=1e-2):
-    """Landmarks, measurements from a true state beside the belief, and a mask with one in five missing."""
-    rng = np.random.default_rng(seed)
-    landmarks = jnp.asarray(np.concatenate([rng.uniform(-2, 2, (n, 2)), rng.uniform(3, 8, (n, 1))], -1))
+@cache
+def sextant_frames():
+    """Landmarks, measurements and states drawn from the model, and a mask with one item in five missing."""
+    rng, frames = np.random.default_rng(0), 200
+    landmarks = jnp.asarray(np.concatenate([rng.uniform(-2, 2, (N, 2)), rng.uniform(3, 8, (N, 1))], -1))
     model, belief = sextant()
-    true = pose.retract(belief.mean, jnp.asarray(rng.normal(0, 0.15, 6)))
-    predict = jax.jit(lambda mean: model.predict(mean, jnp.asarray(1.0)))
-    measure = jax.jit(lambda mean: jax.vmap(model.measure, (None, 0))(mean, landmarks))
-    observed, states = [], []
-    for _ in range(frames):
-        true = predict(true)
-        states.append(true)
-        observed.append(measure(true) + noise * rng.normal(size=(n, 2)))
-    return landmarks, jnp.stack(observed), jnp.asarray(rng.uniform(size=(frames, n)) > 0.2), states
+
+    def advance(mean, draws):
+        mean = model.retract(model.predict(mean, jnp.asarray(1.0)), model.drift * draws[0])
+        R = noise(model, mean, landmarks)
+        z = measure(model, mean, landmarks) + jnp.einsum("nij,nj->ni", jnp.linalg.cholesky(R), draws[1])
+        return mean, (mean, z)
+
+    first = retract(model, belief.mean, np.linalg.cholesky(belief.covariance) @ rng.normal(size=6))
+    draws = jnp.asarray(rng.normal(size=(frames, 6))), jnp.asarray(rng.normal(size=(frames, N, 2)))
+    states, observed = jax.lax.scan(advance, first, draws)[1]
+    return landmarks, observed, jnp.asarray(rng.uniform(size=(frames, N)) > 0.2), states
 
 
 def central(f, x, h=1e-6):
     return np.stack([(np.asarray(f(x + e)) - f(x - e)) / (2 * h) for e in h * np.eye(x.size)], -1)
 
 
+def block_diagonal(blocks):
+    n, m, _ = blocks.shape
+    whole = np.zeros((n, m, n, m))
+    whole[np.arange(n), :, np.arange(n), :] = blocks
+    return whole.reshape(n * m, n * m)
+
+
 def dense_update(model, belief, items, observed, passes):
     """The textbook's iterated EKF: all measurements in one vector, numerical Jacobians, an explicit gain."""
-    P, d = np.asarray(belief.covariance), belief.covariance.shape[0]
-    retract, local = jax.jit(model.retract), jax.jit(model.local)
-    measure = jax.jit(lambda mean: jax.vmap(model.measure, (None, 0))(mean, items).ravel())
-    noise = jax.jit(lambda mean: jax.vmap(model.noise, (None, 0))(mean, items))
-    z, delta = np.asarray(observed).ravel(), np.zeros(d)
+    P, prior = np.asarray(belief.covariance), belief.mean
+    z, delta = np.asarray(observed).ravel(), np.zeros(len(P))
     for _ in range(passes):
-        here = retract(belief.mean, delta)
-        H = central(lambda e: measure(retract(belief.mean, e)), delta)
-        R = jax.scipy.linalg.block_diag(*noise(here))
-        innovation = z - measure(here) + H @ delta
-        S = H @ P @ H.T + R
+        here = retract(model, prior, delta)
+        H = central(lambda e: measure(model, retract(model, prior, e), items).ravel(), delta)
+        innovation = z - measure(model, here, items).ravel() + H @ delta
+        S = H @ P @ H.T + block_diagonal(np.asarray(noise(model, here, items)))
         K = P @ H.T @ np.linalg.inv(S)
-        delta = np.asarray(K @ innovation)
-    mean = retract(belief.mean, delta)
-    reset = central(lambda e: local(mean, retract(belief.mean, e)), delta)
-    log_likelihood = multivariate_normal(np.zeros(z.size), np.asarray(S)).logpdf(innovation)
+        delta = K @ innovation
+    mean = retract(model, prior, delta)
+    reset = central(lambda e: local(model, mean, retract(model, prior, e)), delta)
+    log_likelihood = multivariate_normal(np.zeros(z.size), S).logpdf(innovation)
     nis = innovation @ np.linalg.inv(S) @ innovation
-    return mean, reset @ (np.eye(d) - K @ H) @ P @ reset.T, log_likelihood, nis
+    return mean, reset @ (np.eye(len(P)) - K @ H) @ P @ reset.T, log_likelihood, nis
 
 
 def assert_trees_close(one, two, **tolerances):
@@ -149,10 +201,7 @@ def test_linear_model_is_solved_exactly(m):
         step = np.eye(d) + dt[t] * F
         x, P = step @ x, step @ P @ step.T + dt[t] * Q
         rows, z = H[mask[t]].reshape(-1, d), observed[t][mask[t]].ravel()
-        noise = np.zeros((z.size, z.size))
-        for i, block in enumerate(R[mask[t]]):
-            noise[i * m : (i + 1) * m, i * m : (i + 1) * m] = block
-        S = rows @ P @ rows.T + noise
+        S = rows @ P @ rows.T + block_diagonal(R[mask[t]])
         innovation, K = z - rows @ x, P @ rows.T @ np.linalg.inv(S)
         log_likelihood = -(innovation @ np.linalg.solve(S, innovation) + np.linalg.slogdet(2 * np.pi * S)[1]) / 2
         np.testing.assert_allclose(diagnostics.nis[t], innovation @ np.linalg.solve(S, innovation), atol=1e-11)
@@ -161,181 +210,187 @@ def test_linear_model_is_solved_exactly(m):
         x, P = x + K @ innovation, P - K @ S @ K.T
         np.testing.assert_allclose(beliefs.mean[t], x, atol=1e-11)
         np.testing.assert_allclose(beliefs.covariance[t], P, atol=1e-11)
-        left = np.einsum("nd,ned->ne", innovation_by_item(observed[t], H, x), np.linalg.inv(R))
-        distance = np.einsum("ne,ne->n", left, innovation_by_item(observed[t], H, x))
+        after = observed[t] - H @ x
+        distance = np.einsum("ni,nij,nj->n", after, np.linalg.inv(R), after)
         np.testing.assert_allclose(diagnostics.distance[t], np.where(mask[t], distance, 0), atol=1e-10)
-
-
-def innovation_by_item(observed, H, x):
-    return observed - H @ x
 
 
 @pytest.mark.parametrize("passes", [1, 4])
 def test_update_equals_the_dense_iterated_filter(passes):
     model, belief = sextant()
-    landmarks, observed, mask, _ = sextant_frames(1)
+    landmarks, observed, mask, _ = sextant_frames()
     seen = np.flatnonzero(mask[0])
-    mean, covariance, log_likelihood, nis = dense_update(model, belief, landmarks[seen], observed[0][seen], passes)
+    expected = dense_update(model, belief, landmarks[seen], observed[0][seen], passes)
     posterior, diagnostics = update(model, belief, landmarks, observed[0], mask[0], passes=passes)
-    np.testing.assert_allclose(model.local(mean, posterior.mean), 0, atol=1e-8)
-    np.testing.assert_allclose(posterior.covariance, covariance, rtol=1e-6, atol=1e-10)
-    np.testing.assert_allclose(diagnostics.log_likelihood, log_likelihood, rtol=1e-7)
-    np.testing.assert_allclose(diagnostics.nis, nis, rtol=1e-7)
+    np.testing.assert_allclose(local(model, expected[0], posterior.mean), 0, atol=1e-8)
+    np.testing.assert_allclose(posterior.covariance, expected[1], rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(diagnostics.log_likelihood, expected[2], rtol=1e-7)
+    np.testing.assert_allclose(diagnostics.nis, expected[3], rtol=1e-6)
 
 
 def test_prediction_equals_the_dense_one():
     model, belief = sextant()
     dt = jnp.asarray(1.5)
     predicted = jax.jit(ekf.predict)(model, belief, dt)
-    mean = model.predict(belief.mean, dt)
-    error = jax.jit(lambda e: model.local(mean, model.predict(model.retract(belief.mean, e), dt)))
-    F = central(error, np.zeros(6))
-    np.testing.assert_allclose(model.local(mean, predicted.mean), 0, atol=1e-14)
+    move = jax.jit(lambda mean: model.predict(mean, dt))
+    mean = move(belief.mean)
+    F = central(lambda e: local(model, mean, move(retract(model, belief.mean, e))), np.zeros(6))
+    np.testing.assert_allclose(local(model, mean, predicted.mean), 0, atol=1e-14)
     expected = F @ belief.covariance @ F.T + model.process_noise(mean, dt)
     np.testing.assert_allclose(predicted.covariance, expected, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(ekf.transition)(model, belief.mean, dt), F, atol=1e-8)
 
 
-def log_likelihood(model, belief, items, observed, mask, passes=3):
-    return jnp.sum(ekf.filter(model, belief, items, observed, mask, passes=passes)[1].log_likelihood)
-
-
-value_and_gradient = jax.jit(
-    jax.value_and_grad(log_likelihood, argnums=(0, 1, 2, 3), allow_int=True), static_argnames="passes"
-)
-
-
-@pytest.mark.parametrize("junk", [np.nan, np.inf, 1e30])
-def test_masked_item_is_an_absent_item(junk):
+def test_information_and_gains_equal_the_sums_over_items():
     model, belief = sextant()
-    landmarks, observed, _, _ = sextant_frames(2)
-    seen = jnp.arange(12) % 3 != 1
-    value, gradient = value_and_gradient(
-        model,
-        belief,
-        jnp.where(seen[:, None], landmarks, junk),
-        jnp.where(seen[:, None], observed, junk),
-        jnp.stack([seen, seen]),
+    landmarks, _, mask, _ = sextant_frames()
+    weights = jnp.where(mask[0], jnp.linspace(0.2, 1.0, N), 0.0)
+    junk = jnp.where(mask[0][:, None], landmarks, jnp.nan)
+    A, gains = jax.jit(ekf.information)(model, belief.mean, junk, weights)
+    H = central(lambda e: measure(model, retract(model, belief.mean, e), landmarks), np.zeros(6))
+    R = np.asarray(noise(model, belief.mean, landmarks))
+    shares = [w * h.T @ np.linalg.inv(r) for w, h, r in zip(weights, H, R, strict=True)]
+    expected = sum(share @ h for share, h in zip(shares, H, strict=True))
+    np.testing.assert_allclose(A, expected, atol=1e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(gains, np.stack(shares), atol=1e-7 * np.abs(shares).max())
+
+
+@jax.jit
+def log_likelihood(model, belief, items, observed, mask):
+    mask = jnp.broadcast_to(mask, observed.shape[:2])
+    diagnostics = ekf.filter(model, belief, items, observed, mask, passes=4, robust=ROBUST)[1]
+    return jnp.sum(diagnostics.log_likelihood)
+
+
+# Over a batch of models, items and measurements.
+gradient = jax.jit(jax.vmap(jax.grad(log_likelihood, argnums=(0, 1, 2, 3)), (0, None, 0, 0, None)))
+
+
+def test_masked_item_is_an_absent_item_in_values_and_gradients():
+    # At the origin, where the belief stands, the distance to a beacon of zeros has no derivative.
+    model, belief, beacons, observed, seen = ranger()
+    junk = jnp.array([0.0, np.nan, np.inf, 1e30])
+    absent = log_likelihood(model, belief, beacons[seen], observed[:, seen], jnp.ones(6, bool))
+    filled = (
+        jnp.where(seen[:, None], beacons, junk[:, None, None]),
+        jnp.where(seen[:, None], observed, junk[:, None, None, None]),
     )
-    expected, slope = value_and_gradient(model, belief, landmarks[seen], observed[:, seen], jnp.ones((2, 8), bool))
-    np.testing.assert_allclose(value, expected, rtol=1e-12)
-    assert_trees_close(gradient[:2], slope[:2], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(gradient[2][seen], slope[2], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(gradient[3][:, seen], slope[3], rtol=1e-9, atol=1e-9)
-    assert not np.any(gradient[2][~seen])
-    assert not np.any(gradient[3][:, ~seen])
+    for one in zip(*filled, strict=True):
+        np.testing.assert_allclose(log_likelihood(model, belief, *one, seen), absent, rtol=1e-12)
+    models = jax.tree.map(lambda x: jnp.broadcast_to(x, (4, *x.shape)), model)
+    slopes = gradient(models, belief, *filled, seen)
+    for leaf in jax.tree.leaves(slopes):
+        np.testing.assert_allclose(leaf, np.broadcast_to(leaf[:1], leaf.shape), rtol=1e-12)
+    assert not np.any(slopes[2][:, ~seen])
+    assert not np.any(slopes[3][:, :, ~seen])
+    assert np.all(slopes[3][:, :, seen] != 0)
 
 
-@pytest.mark.parametrize("robust", [None, ekf.Robust()])
-def test_order_of_items_changes_nothing(robust):
+def test_gradients_through_the_filter_equal_central_differences():
+    _, belief, beacons, observed, seen = ranger()
+    theta = jnp.array([[0.03, 0.1], [0.05, 0.2], [0.07, 0.05], [0.1, 0.1]])
+    repeated = (jnp.broadcast_to(x, (4, *x.shape)) for x in (beacons, observed))
+    slopes = gradient(Ranger(theta[:, 0], theta[:, 1]), belief, *repeated, seen)
+
+    def value(theta, mean):
+        model = Ranger(*jnp.asarray(theta))
+        return log_likelihood(model, ekf.Belief(jnp.asarray(mean), belief.covariance), beacons, observed, seen)
+
+    for i in range(4):
+        by_model = central(lambda x: value(x, belief.mean), np.asarray(theta[i]))
+        np.testing.assert_allclose(slopes[0].sigma[i], by_model[0], rtol=1e-6)
+        np.testing.assert_allclose(slopes[0].acceleration[i], by_model[1], rtol=1e-6)
+        by_mean = central(lambda x, i=i: value(theta[i], x), np.zeros(4))
+        np.testing.assert_allclose(slopes[1].mean[i], by_mean, rtol=1e-5)
+
+
+def test_order_of_items_changes_nothing():
     model, belief = sextant()
-    landmarks, observed, mask, _ = sextant_frames(1)
-    order = np.random.default_rng(1).permutation(12)
-    one = update(model, belief, landmarks, observed[0], mask[0], passes=8, robust=robust)
-    two = update(model, belief, landmarks[order], observed[0][order], mask[0][order], passes=8, robust=robust)
+    landmarks, observed, mask, _ = sextant_frames()
+    order = np.random.default_rng(1).permutation(N)
+    one = update(model, belief, landmarks, observed[0], mask[0], passes=9, robust=ROBUST)
+    two = update(model, belief, landmarks[order], observed[0][order], mask[0][order], passes=9, robust=ROBUST)
     assert_trees_close(one[0], two[0], rtol=1e-9, atol=1e-12)
-    assert_trees_close(one[1].log_likelihood, two[1].log_likelihood, rtol=1e-9)
-    assert_trees_close(one[1].weights[order], two[1].weights, rtol=1e-7)
-    assert_trees_close(one[1].distance[order], two[1].distance, rtol=1e-7)
+    np.testing.assert_allclose(one[1].log_likelihood, two[1].log_likelihood, rtol=1e-9)
+    np.testing.assert_allclose(one[1].weights[order], two[1].weights, rtol=1e-7)
+    np.testing.assert_allclose(one[1].distance[order], two[1].distance, rtol=1e-7)
 
 
 def test_pinned_direction_stays_pinned():
     model, belief = sextant()
-    landmarks, observed, mask, _ = sextant_frames(1)
-    # The tree's leaves stand in the order of their keys: R, then T.
-    direction = np.array([0, 0, 0, 1.0, 2.0, -1.0])
-    direction /= np.linalg.norm(direction)
+    landmarks, observed, mask, _ = sextant_frames()
+    # The leaves stand in the order of their keys: R, then T.
+    direction = np.array([0, 0, 0, 1.0, 2.0, -1.0]) / np.sqrt(6)
     project = np.eye(6) - np.outer(direction, direction)
     pinned = ekf.Belief(belief.mean, project @ belief.covariance @ project)
     posterior, diagnostics = update(model, pinned, landmarks, observed[0], mask[0], passes=4)
-    moved = model.local(belief.mean, posterior.mean)
+    moved = local(model, belief.mean, posterior.mean)
     assert np.linalg.norm(moved) > 0.05
-    np.testing.assert_allclose(moved @ direction, 0, atol=1e-14)
+    np.testing.assert_allclose(moved @ direction, 0, atol=1e-12)
     np.testing.assert_allclose(posterior.covariance @ direction, 0, atol=1e-14)
-    assert np.linalg.eigvalsh(posterior.covariance)[1] > 1e-6
+    assert np.linalg.eigvalsh(posterior.covariance)[1] > 1e-7
     assert np.isfinite(diagnostics.log_likelihood)
 
 
 def test_gross_outliers_are_rejected_and_the_clean_answer_returns():
     model, belief = sextant()
-    landmarks, observed, _, states = sextant_frames(1, n=60)
-    bad = np.arange(60) < 18
-    broken = observed[0] + np.where(bad, 1.0, 0.0)[:, None] * np.random.default_rng(0).uniform(-0.6, 0.6, (60, 2))
-    everything = jnp.ones(60, bool)
-    run = partial(update, model, belief, landmarks, passes=9)
-    clean, _ = run(observed[0], jnp.asarray(~bad))
-    robust, diagnostics = run(broken, everything, robust=ekf.Robust())
-    plain, _ = run(broken, everything)
+    landmarks, observed, _, states = sextant_frames()
+    bad = np.arange(N) % 4 == 0
+    shift = np.random.default_rng(0).uniform(0.2, 0.6, (N, 2)) * np.where(np.arange(N)[:, None] % 8, 1, -1)
+    broken = observed[0] + np.where(bad[:, None], shift, 0)
+    run = partial(update, model, belief, landmarks)
+    clean, _ = run(observed[0], jnp.asarray(~bad), passes=4)
+    plain, _ = run(broken, jnp.ones(N, bool), passes=4)
+    robust, diagnostics = run(broken, jnp.ones(N, bool), passes=9, robust=ROBUST)
     sd = np.sqrt(np.diag(clean.covariance))
-    assert np.max(np.abs(model.local(clean.mean, robust.mean)) / sd) < 1
-    assert np.max(np.abs(model.local(clean.mean, plain.mean)) / sd) > 5
-    assert np.max(np.abs(model.local(states[0], robust.mean)) / sd) < 4
-    gross = bad & (np.asarray(diagnostics.distance) > 30)
-    assert gross.sum() >= 15
-    assert not np.any(np.asarray(diagnostics.weights)[gross])
-    assert np.median(np.asarray(diagnostics.weights)[~bad]) > 0.7
-    assert diagnostics.used == np.sum(np.asarray(diagnostics.weights) > 0)
-    # Judged by a plain filter on what was kept, the weights have cost little information.
-    np.testing.assert_allclose(np.sqrt(np.diag(robust.covariance)), sd, rtol=0.2)
+    assert np.max(np.abs(local(model, clean.mean, plain.mean)) / sd) > 5
+    assert np.max(np.abs(local(model, clean.mean, robust.mean)) / sd) < 1
+    truth = jax.tree.map(lambda x: x[0], states)
+    assert np.max(np.abs(local(model, truth, robust.mean)) / sd) < 4
+    weights = np.asarray(diagnostics.weights)
+    assert not weights[bad].any()
+    assert (diagnostics.distance[bad] > 100).all()
+    assert np.median(weights[~bad]) > 0.6
+    assert diagnostics.used == np.sum(weights > 0) >= N - bad.sum() - 2
+    np.testing.assert_allclose(np.sqrt(np.diag(robust.covariance)), sd, rtol=0.3)
 
 
 def test_a_large_scale_makes_the_robust_update_the_plain_one():
     model, belief = sextant()
-    landmarks, observed, mask, _ = sextant_frames(1)
+    landmarks, observed, mask, _ = sextant_frames()
     large = ekf.Robust(*(jnp.asarray(x) for x in (1e14, 1e14, jnp.inf)))
-    one = update(model, belief, landmarks, observed[0], mask[0], passes=8, robust=large)
-    two = update(model, belief, landmarks, observed[0], mask[0], passes=8)
-    assert_trees_close(one, two, rtol=1e-9, atol=1e-11)
+    one = update(model, belief, landmarks, observed[0], mask[0], passes=9, robust=large)
+    two = update(model, belief, landmarks, observed[0], mask[0], passes=9)
+    assert_trees_close(one, two, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(one[1].weights, mask[0], rtol=1e-10)
 
 
 def test_filter_is_a_loop_of_step():
     model, belief = sextant()
-    landmarks, observed, mask, _ = sextant_frames(4)
+    landmarks, observed, mask, _ = sextant_frames()
     dt = jnp.array([1.0, 0.5, 1.0, 2.0])
-    robust = ekf.Robust()
-    beliefs, diagnostics = filter_(model, belief, landmarks, observed, mask, dt, passes=8, robust=robust)
-    step = jax.jit(ekf.step, static_argnames="passes")
+    beliefs, diagnostics = filter_(model, belief, landmarks, observed[:4], mask[:4], dt, passes=4)
+    predict = jax.jit(ekf.predict)
     for t in range(4):
-        belief, report = step(model, belief, landmarks, observed[t], mask[t], dt[t], passes=8, robust=robust)
+        predicted = predict(model, belief, dt[t])
+        belief, report = update(model, predicted, landmarks, observed[t], mask[t], passes=4)
         here = jax.tree.map(lambda x, t=t: x[t], (beliefs, diagnostics))
         assert_trees_close(here, (belief, report), rtol=1e-9, atol=1e-11)
 
 
-def test_gradients_through_the_filter_equal_central_differences_in_a_batch():
-    landmarks, observed, mask, _ = sextant_frames(3)
-    model, belief = sextant()
-
-    @jax.jit
-    @jax.vmap
-    def value(theta):
-        tuned = eqx.tree_at(lambda m: (m.sigma, m.drift), model, (jnp.exp(theta[0]), jnp.exp(theta[1])))
-        return log_likelihood(tuned, belief, landmarks, observed, mask)
-
-    theta = jnp.log(jnp.array([[0.01, 0.02], [0.02, 0.01], [0.005, 0.1]]))
-    gradient = jax.jit(jax.grad(lambda x: jnp.sum(value(x))))(theta)
-    h = 1e-5
-    for i, e in enumerate(np.eye(2)):
-        np.testing.assert_allclose(gradient[:, i], (value(theta + h * e) - value(theta - h * e)) / (2 * h), rtol=1e-6)
-    # A batch is a stack of single runs.
-    np.testing.assert_allclose(value(theta)[1], value(theta[1:2])[0], rtol=1e-12)
-
-
-@pytest.mark.parametrize("robust", [None, ekf.Robust()])
-def test_float32_stays_float32_and_positive_over_a_long_run(robust):
-    landmarks, observed, mask, states = sextant_frames(200)
+def test_float32_stays_float32_and_positive_over_a_long_run():
     single = partial(jax.tree.map, lambda x: x.astype(jnp.float32))
+    landmarks, observed, mask, states = sextant_frames()
     model, belief = sextant(jnp.float32)
-    passes = 1 if robust is None else 8
-    beliefs, diagnostics = filter_(
-        model, belief, single(landmarks), single(observed), mask, passes=passes, robust=robust
-    )
+    arguments = model, belief, single(landmarks), single(observed), mask
+    beliefs, diagnostics = filter_(*arguments, passes=9, robust=ROBUST)
     for leaf in jax.tree.leaves((beliefs, eqx.filter(diagnostics, eqx.is_inexact_array))):
         assert leaf.dtype == jnp.float32
         assert np.isfinite(leaf).all()
     P = np.asarray(beliefs.covariance, np.float64)
-    size = np.abs(P).max(axis=(1, 2))
-    assert (np.abs(P - P.swapaxes(1, 2)).max(axis=(1, 2)) < 1e-6 * size).all()
+    asymmetry = np.abs(P - P.swapaxes(1, 2)).max(axis=(1, 2))
+    assert (asymmetry < 1e-6 * np.abs(P).max(axis=(1, 2))).all()
     assert (np.linalg.eigvalsh((P + P.swapaxes(1, 2)) / 2)[:, 0] > 0).all()
-    errors = jax.vmap(model.local)(beliefs.mean, single(jax.tree.map(lambda *x: jnp.stack(x), *states)))
+    errors = jax.vmap(model.local)(beliefs.mean, single(states))
     nees = np.einsum("ti,tij,tj->t", errors, np.linalg.inv(P), errors)
-    assert 4 < nees[20:].mean() < 9
+    assert 5 < nees.mean() < 7.5

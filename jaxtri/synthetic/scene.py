@@ -1,6 +1,7 @@
 """A small renderer of textured rectangles with exact truth, in NumPy: rays, a depth buffer, area sampling."""
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -142,15 +143,23 @@ def rendered_sequence(
     noise_gray: float = 0.0,
     seed: int = 0,
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """The images (BGR) along a trajectory, with Gaussian noise of the given deviation in gray levels."""
-    rng = np.random.default_rng(seed)
+    """The images (BGR) along a trajectory, with Gaussian noise of the given deviation in gray levels.
+
+    Rendered ahead by two threads, since nearly all of it is NumPy's.
+    """
     rays = pixel_rays(camera)
-    for T in np.asarray(T_world_camera, np.float64):
+
+    def frame(k: int, T: np.ndarray) -> np.ndarray:
         image = render(scene, camera, np.linalg.solve(T, np.eye(4)), rays=rays).image
-        if noise_gray > 0:
-            noisy = image + rng.normal(scale=noise_gray, size=image.shape)
-            image = (noisy + 0.5).clip(0, 255).astype(np.uint8)
-        yield image
+        if noise_gray == 0:
+            return image
+        noise = np.random.default_rng((seed, k)).standard_normal(image.shape, np.float32)
+        return (image + noise_gray * noise + 0.5).clip(0, 255).astype(np.uint8)
+
+    poses = np.asarray(T_world_camera, np.float64)
+    with ThreadPoolExecutor(2) as pool:
+        for k in range(0, len(poses), 16):  # a few at a time: a long sequence need not fit into memory
+            yield from pool.map(frame, range(k, len(poses)), poses[k : k + 16])
 
 
 class _Face(NamedTuple):
@@ -235,8 +244,15 @@ def _integral(table: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """The integral of the texture over [0, u] x [0, v], which is exactly bilinear in between texels."""
     rows, columns = table.shape[:2]
     i, j = np.minimum(v.astype(np.int64), rows - 2), np.minimum(u.astype(np.int64), columns - 2)
-    fv, fu = (v - i)[:, None], (u - j)[:, None]
+    fv, fu = v - i, u - j
     flat, at = table.reshape(-1, 3), i * columns + j
-    top = flat[at] * (1 - fu) + flat[at + 1] * fu
-    bottom = flat[at + columns] * (1 - fu) + flat[at + columns + 1] * fu
-    return top * (1 - fv) + bottom * fv
+    total = np.zeros((len(u), 3))
+    # `take` gathers rows four times faster than an index does.
+    for shift, weight in (
+        (0, (1 - fv) * (1 - fu)),
+        (1, (1 - fv) * fu),
+        (columns, fv * (1 - fu)),
+        (columns + 1, fv * fu),
+    ):
+        total += weight[:, None] * flat.take(at + shift, axis=0)
+    return total

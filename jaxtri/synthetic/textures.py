@@ -66,10 +66,7 @@ def wood(rows: int, columns: int, rng: np.random.Generator) -> UInt8[np.ndarray,
     boards = np.arange(rows) * 6 // rows
     tone = rng.normal(scale=5, size=6)[boards][:, None]
     grain = sum(
-        k
-        * _bilinear(
-            rng.normal(size=(rows // a + 2, columns // b + 2)), np.arange(rows) / a, np.arange(columns) / b
-        )
+        k * _bilinear(rng.normal(size=(rows // a + 2, columns // b + 2)), np.arange(rows) / a, np.arange(columns) / b)
         for k, a, b in ((7, 4, 90), (6, 12, 200), (3, 2, 30))
     )
     image = np.array([128, 168, 200]) + (tone + grain)[..., None] * np.array([1.1, 1.0, 0.9])
@@ -77,9 +74,7 @@ def wood(rows: int, columns: int, rng: np.random.Generator) -> UInt8[np.ndarray,
     return image.clip(0, 255).astype(np.uint8)
 
 
-def write(
-    image: np.ndarray, box: tuple[int, int, int, int], height: int, ink: Colour, rng: np.random.Generator
-):
+def write(image: np.ndarray, box: tuple[int, int, int, int], height: int, ink: Colour, rng: np.random.Generator):
     """Fill the box (first row, first column, rows, columns) of an image with lines of invented letters."""
     r0, c0, rows, columns = box
     stroke, line = max(height // 5, 1), int(1.7 * height)
@@ -101,9 +96,7 @@ def write(
             c += height // 2
 
 
-def printed(
-    rows: int, columns: int, colour: Colour, rng: np.random.Generator
-) -> UInt8[np.ndarray, "rows columns 3"]:
+def printed(rows: int, columns: int, colour: Colour, rng: np.random.Generator) -> UInt8[np.ndarray, "rows columns 3"]:
     """The printed face of a package: a band, a title, an emblem, small text and a bar code."""
     colour = np.asarray(colour, float)
     image = mottled(rows, columns, colour, rng, strength=3).astype(float)
@@ -118,15 +111,11 @@ def printed(
     image[distance < radius] = light
     image[distance < radius * (0.55 + 0.3 * np.sign(np.cos(rng.integers(3, 7) * angle)))] = ink
     image[distance < 0.15 * radius] = dark
-    write(
-        image, (int(0.42 * rows), int(0.56 * columns), int(0.3 * rows), int(0.4 * columns)), unit, dark, rng
-    )
+    write(image, (int(0.42 * rows), int(0.56 * columns), int(0.3 * rows), int(0.4 * columns)), unit, dark, rng)
     top, left, wide = rows - 4 * unit, int(0.6 * columns), int(0.32 * columns)
     image[top : top + 3 * unit, left : left + wide] = light
     bars = np.repeat(rng.random(wide // 4) < 0.5, 3)[: wide - unit]
-    image[top + unit // 2 : top + 3 * unit - unit // 2, left + unit // 2 : left + unit // 2 + bars.size][
-        :, bars
-    ] = 30
+    image[top + unit // 2 : top + 3 * unit - unit // 2, left + unit // 2 : left + unit // 2 + bars.size][:, bars] = 30
     write(image, (rows - 4 * unit, unit, 3 * unit, int(0.45 * columns)), max(unit // 2, 4), dark, rng)
     image[: unit // 3], image[:, : unit // 3], image[:, -unit // 3 :] = (
         0.8 * colour,
@@ -165,9 +154,7 @@ def page(rows: int, columns: int, rng: np.random.Generator) -> UInt8[np.ndarray,
     m = columns // 10
     write(image, (m, m, rows // 8, columns - 2 * m), rows // 20, (40, 40, 40), rng)
     write(image, (rows // 5, m, rows * 7 // 10, columns - 2 * m), rows // 45, (70, 70, 70), rng)
-    image[rows // 2 : rows * 3 // 4, m:-m] = patches(
-        rows * 3 // 4 - rows // 2, columns - 2 * m, rng, count=40
-    )
+    image[rows // 2 : rows * 3 // 4, m:-m] = patches(rows * 3 // 4 - rows // 2, columns - 2 * m, rng, count=40)
     return image
 
 
@@ -188,9 +175,7 @@ def spines(rows: int, columns: int, rng: np.random.Generator) -> UInt8[np.ndarra
         top = int(rows * rng.uniform(0.0, 0.16))
         colour = INKS[rng.integers(len(INKS))] * rng.uniform(0.7, 1.25) + rng.uniform(0, 40)
         book = image[top:, c : c + max(width - 2, 1)]
-        book[:] = (
-            colour * np.interp(np.arange(book.shape[1]), [0, width / 3, width], [0.8, 1.1, 0.75])[:, None]
-        )
+        book[:] = colour * np.interp(np.arange(book.shape[1]), [0, width / 3, width], [0.8, 1.1, 0.75])[:, None]
         for at in rng.uniform(0.05, 0.9, 3):
             book[int(at * book.shape[0]) :][: rows // 40] = PAPER if rng.random() < 0.6 else 0.4 * colour
         title = np.array(book[int(0.3 * book.shape[0]) : int(0.75 * book.shape[0])].transpose(1, 0, 2))

@@ -52,11 +52,7 @@ class Capture:
             self.capture = cv2.VideoCapture(source)
             opened = self.capture.isOpened()
         if not opened:
-            hint = (
-                "is it connected and free?"
-                if self.live
-                else "not a video that OpenCV can decode, or cut short"
-            )
+            hint = "is it connected and free?" if self.live else "not a video that OpenCV can decode, or cut short"
             raise VideoError(f"{name}: cannot be opened; {hint}")
         count, fps = self.capture.get(cv2.CAP_PROP_FRAME_COUNT), self.capture.get(cv2.CAP_PROP_FPS)
         # Containers without an index give nonsense (-9e18 for a bare MJPEG stream).
@@ -90,16 +86,14 @@ class Folder:
     def __init__(self, folder: Path):
         self.files = _images(folder) or _images(folder / "frames")
         if not self.files:
-            raise VideoError(
-                f"{folder}: no images here or in {folder / 'frames'} ({', '.join(IMAGE_SUFFIXES)})"
-            )
+            raise VideoError(f"{folder}: no images here or in {folder / 'frames'} ({', '.join(IMAGE_SUFFIXES)})")
         self.times: list[float] | None = None
         home = self.files[0].parent
         for stamps in (home / "timestamps.txt", home.parent / "timestamps.txt"):
             if stamps.is_file():
                 self.times, self.files = _read_timestamps(stamps, self.files)
                 break
-        self.declared = len(self.files)
+        self.declared: int | None = len(self.files)
         self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
         self.index = -1
 
@@ -122,8 +116,7 @@ def _images(folder: Path) -> list[Path]:
     return sorted(
         files,
         key=lambda p: [
-            (part.isdecimal(), int(part) if part.isdecimal() else 0, part)
-            for part in re.split(r"(\d+)", p.name)
+            (part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", p.name)
         ],
     )
 
@@ -152,14 +145,10 @@ def _read_timestamps(path: Path, images: list[Path]) -> tuple[list[float], list[
         except ValueError:
             time_s = math.nan
         if not math.isfinite(time_s) or (times and time_s <= times[-1]):
-            raise VideoError(
-                f"{path}, line {n}: {words[0]!r} is not a time in seconds later than the one before"
-            )
+            raise VideoError(f"{path}, line {n}: {words[0]!r} is not a time in seconds later than the one before")
         times.append(time_s)
     if all(len(words) > 1 for _, words in lines):
         images = [path.parent / words[1] for _, words in lines]
         if missing := [str(p) for p in images if not p.is_file()]:
-            raise VideoError(
-                f"{path} names {missing[0]}, which does not exist ({len(missing)} missing in all)"
-            )
+            raise VideoError(f"{path} names {missing[0]}, which does not exist ({len(missing)} missing in all)")
     return times, images

@@ -1,0 +1,105 @@
+"""The files of a run: trajectory, plot, points, overlay, and the record of how they came about."""
+
+import importlib.metadata
+import platform
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxtri.errors import InputError
+from jaxtri.geometry.camera import Camera
+from jaxtri.io import atomic_path, write_json, write_ply, write_tum
+from jaxtri.pipeline import Run
+from jaxtri.plot import plot_trajectory
+from jaxtri.tracker import Status
+from jaxtri.trajectory import Trajectory
+from jaxtri.vision.overlay import car, draw_text, draw_wireframe, place
+from jaxtri.vision.video import Frame, write_video
+
+PACKAGES = ("jaxtri", "jax", "equinox", "optimistix", "jaxlie", "numpy", "opencv-python-headless")
+NAMES = {int(s): s.name.lower() for s in Status}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that the figures of a run depend on."""
+    return {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in PACKAGES}
+
+
+def write_results(run: Run, out: Path, settings: dict[str, object], reference: Trajectory | None = None) -> list[Path]:
+    """Write trajectory.txt, trajectory.png, points.ply and run.json; returns their paths.
+
+    `reference` is the truth in the frame and scale of the run, for the plot.
+    """
+    paths = [out / name for name in ("trajectory.txt", "trajectory.png", "points.ply", "run.json")]
+    status = run.trajectory.status
+    assert status is not None
+    unsure = [f"{NAMES[code]}: frames {_ranges(status == code)}" for code in NAMES if code != 1 and (status == code).any()]
+    header = "timestamp tx ty tz qx qy qz qw   camera to world, camera x right y down z forward, scale: gauge"
+    write_tum(paths[0], run.trajectory, "\n".join([header, *unsure]))
+    figure = plot_trajectory(
+        run.trajectory,
+        reference=reference,
+        points=run.points.xyz[precise(run)],
+        names=NAMES,
+        units="first base line" if reference is None else "m",
+    )
+    with atomic_path(paths[1]) as temporary:
+        figure.savefig(temporary, dpi=120)
+    sd = np.sqrt(np.linalg.eigvalsh(run.points.covariance)[:, -1]) if len(run.points.ids) else np.zeros(0)
+    write_ply(paths[2], run.points.xyz, run.colours, {"sd": sd})
+    write_json(paths[3], {"settings": settings, "versions": versions(), "statistics": run.statistics})
+    return paths
+
+
+def precise(run: Run, share: float = 0.1) -> np.ndarray:
+    """Points (n,) whose standard deviation is below a share of their distance from the camera's path."""
+    if not len(run.points.ids):
+        return np.zeros(0, bool)
+    sd = np.sqrt(np.linalg.eigvalsh(run.points.covariance)[:, -1])
+    distance = np.linalg.norm(run.points.xyz - run.trajectory.positions.mean(axis=0), axis=1)
+    return sd < share * distance
+
+
+def write_overlay(
+    run: Run,
+    frames: Iterable[Frame],
+    camera: Camera,
+    path: Path,
+    fps: float,
+    *,
+    at: tuple[float, float] | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write the frames with a wire-frame car that stands in the scene; `at` is its pixel in the middle frame.
+
+    Raises `InputError` where there is no place for it.
+    """
+    good = precise(run)
+    if good.sum() < 10:
+        raise InputError(f"only {int(good.sum())} points are known well enough to stand anything on")
+    posed = [k for k, p in enumerate(run.odometry.poses) if p.T_camera_world is not None]
+    middle = posed[len(posed) // 2]
+    T_world_car = place(run.points.xyz[good], run.trajectory.T_world_camera[middle], camera, pixel=at)
+    wireframe = car()
+
+    def drawn() -> Iterator[np.ndarray]:
+        total = len(run.odometry.poses)
+        bar = tqdm(frames, total=total, unit="frame", desc="overlay", disable=None if progress else True, leave=False)
+        for frame, pose in zip(bar, run.odometry.poses, strict=False):
+            image = frame.image
+            if pose.T_camera_world is not None:
+                image = draw_wireframe(image, camera, pose.T_camera_world, T_world_car, wireframe)
+            text = f"frame {frame.index}  {pose.status.name.lower()}"
+            yield draw_text(image, f"{text}  {pose.used} points" if pose.used else text)
+
+    write_video(path, drawn(), fps)
+    return path
+
+
+def _ranges(mask: np.ndarray) -> str:
+    """The True entries as ranges: 0-4, 9."""
+    at = np.flatnonzero(mask)
+    groups = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+    return ", ".join(f"{g[0]}-{g[-1]}" if len(g) > 1 else f"{g[0]}" for g in groups)
