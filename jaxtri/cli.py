@@ -92,6 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
     jax.config.update("jax_enable_x64", True)
     try:
         with warnings.catch_warnings():
+            warnings.simplefilter("always", TruncatedVideoWarning)
             warnings.showwarning = _show
             {Track: _track, Evaluate: _evaluate, Demo: _demo}[type(command)](command)
     except (JaxtriError, OSError) as error:

@@ -1,11 +1,13 @@
 """Pictures of a trajectory, as in figures 9, 11 and 13 of Yu et al. 2006, with what is known of its errors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxlie import SO3
+from jaxtyping import Array, Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxtri.geometry.pose import euler_from_matrix
@@ -17,10 +19,24 @@ SHADES = {"initialising": "#BBBBBB", "coasting": "#F0E442", "restarted": "#CC79A
 MARKERS = ("^", "o", "s")
 
 
-def yaw_pitch_roll(R: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
-    """The paper's angles of rotations, degrees, without jumps; relative to the first."""
-    relative = jnp.asarray(np.swapaxes(R[:1], 1, 2) @ R)
+def yaw_pitch_roll(
+    R: Float[np.ndarray, "t 3 3"], origin: Float[np.ndarray, "3 3"] | None = None
+) -> Float[np.ndarray, "t 3"]:
+    """The paper's angles of rotations, degrees, without jumps; relative to `origin`, or else to the first."""
+    relative = jnp.asarray((R[0] if origin is None else origin).T @ R)
     return np.rad2deg(np.unwrap(np.asarray(jax.vmap(euler_from_matrix)(relative), np.float64), axis=0))
+
+
+@jax.jit
+@jax.vmap
+def _angle_variance(relative: Float[Array, "3 3"], covariance: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Variances of yaw, pitch, roll from the covariance of the rotation vector in camera axes, to first order."""
+
+    def angles(dtheta):
+        return euler_from_matrix(relative @ SO3.exp(dtheta).as_matrix())
+
+    J = jax.jacfwd(angles)(jnp.zeros(3, relative.dtype))
+    return jnp.diagonal(J @ covariance @ J.T)
 
 
 def plot_trajectory(
@@ -35,7 +51,7 @@ def plot_trajectory(
     """The path from above and from the side, and translation and rotation over time with 2-sigma bands.
 
     `reference` must be in the frame and scale of the trajectory already. `names` of the status codes: frames
-    of any but "tracking" are shaded.
+    of any but "tracking" are shaded. Lines are broken where more than two frames have no pose.
     """
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     above, side, move, turn = figure.subplots(2, 2).ravel()
@@ -50,8 +66,8 @@ def plot_trajectory(
         if points is not None and len(points):
             _cloud(axes, points[:, [i, j]], p[:, [i, j]])
         if reference is not None:
-            axes.plot(*reference.positions[:, [i, j]].T, color="black", lw=1, ls="--", label="truth")
-        axes.plot(*p[:, [i, j]].T, color=COLOURS[0], lw=1.8, label="estimate")
+            axes.plot(*_broken(reference.times, reference.positions[:, [i, j]]).T, "k--", lw=1, label="truth")
+        axes.plot(*_broken(seconds, p[:, [i, j]]).T, color=COLOURS[0], lw=1.8, label="estimate")
         axes.plot(*p[0, [i, j]], "o", color=COLOURS[2], label="start")
         axes.set(xlabel=f"{labels[0]} [{units}]", ylabel=f"{labels[1]} [{units}]", title=name)
         axes.set_aspect("equal", adjustable="datalim")
@@ -61,15 +77,19 @@ def plot_trajectory(
     angles = yaw_pitch_roll(trajectory.rotations)
     sd_p = sd_r = None
     if trajectory.covariance is not None:
-        variance = np.diagonal(trajectory.covariance, axis1=1, axis2=2)
-        sd_p = np.sqrt(np.maximum(variance[:, :3], 0))
-        # Rotation vectors (x, y, z) of small angles are pitch, yaw, roll.
-        sd_r = np.rad2deg(np.sqrt(np.maximum(variance[:, [4, 3, 5]], 0)))
-    truth_p = truth_r = None
+        C = trajectory.covariance
+        sd_p = np.sqrt(np.maximum(np.diagonal(C[:, :3, :3], axis1=1, axis2=2), 0))
+        R = trajectory.rotations
+        variance = np.asarray(_angle_variance(jnp.asarray(R[0].T @ R), jnp.asarray(C[:, 3:, 3:])), np.float64)
+        sd_r = np.rad2deg(np.sqrt(np.maximum(variance, 0)))
+    _curves(move, seconds, p - p[0], sd_p, ("$t_x$", "$t_y$", "$t_z$"))
+    _curves(turn, seconds, angles, sd_r, ("yaw", "pitch", "roll"))
     if reference is not None:
-        truth_p, truth_r = reference.positions, yaw_pitch_roll(reference.rotations)
-    _curves(move, seconds, p - p[0], sd_p, ("$t_x$", "$t_y$", "$t_z$"), reference, None if truth_p is None else truth_p - truth_p[0])
-    _curves(turn, seconds, angles, sd_r, ("yaw", "pitch", "roll"), reference, truth_r)
+        times = reference.times - trajectory.times[0]
+        truths = (reference.positions - p[0], yaw_pitch_roll(reference.rotations, trajectory.rotations[0]))
+        for axes, truth in zip((move, turn), truths, strict=True):
+            lines = axes.plot(_broken(times, times), _broken(times, truth), "k--", lw=0.9)
+            lines[0].set_label("truth")
     move.set(xlabel="time [s]", ylabel=f"translation [{units}]", title="translation, with 2 sigma")
     turn.set(xlabel="time [s]", ylabel="rotation [degrees]", title="rotation, with 2 sigma")
     if trajectory.status is not None and names is not None:
@@ -84,27 +104,35 @@ def plot_trajectory(
     return figure
 
 
-def _curves(axes, seconds, values, sd, labels, reference, truth) -> None:
+def _broken(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The values with a NaN put into every gap of more than two frames: matplotlib breaks its lines there."""
+    steps = np.diff(times)
+    gaps = np.flatnonzero(steps > 3.5 * np.median(steps)) + 1 if len(steps) else []
+    return np.insert(np.asarray(values, np.float64), gaps, np.nan, axis=0)
+
+
+def _curves(axes: Axes, seconds: np.ndarray, values: np.ndarray, sd: np.ndarray | None, labels: Sequence[str]) -> None:
+    every, x = max(len(seconds) // 12, 1), _broken(seconds, seconds)
     for k, label in enumerate(labels):
-        every = max(len(seconds) // 12, 1)
-        axes.plot(seconds, values[:, k], color=COLOURS[k], lw=1.5, marker=MARKERS[k], markevery=every, ms=5, label=label)
+        y, colour = _broken(seconds, values[:, k]), COLOURS[k]
+        axes.plot(x, y, color=colour, lw=1.5, marker=MARKERS[k], markevery=every, ms=5, label=label)
         if sd is not None:
-            low, high = values[:, k] - 2 * sd[:, k], values[:, k] + 2 * sd[:, k]
-            axes.fill_between(seconds, low, high, color=COLOURS[k], alpha=0.22, lw=0)
-        if truth is not None:
-            times = reference.times - reference.times[0]
-            axes.plot(times, truth[:, k], color="black", lw=0.9, ls="--", label="truth" if k == 0 else None)
+            half = 2 * _broken(seconds, sd[:, k])
+            axes.fill_between(x, y - half, y + half, color=colour, alpha=0.22, lw=0)
 
 
-def _shade(axes, seconds, status, names) -> None:
-    shown = set()
+def _shade(axes: Axes, seconds: np.ndarray, status: np.ndarray, names: Mapping[int, str]) -> None:
     half = np.median(np.diff(seconds)) / 2 if len(seconds) > 1 else 0.5
-    for t, code in zip(seconds, status, strict=True):
-        name = names.get(int(code), "")
+    # A span for each run of one status without a gap.
+    breaks = (np.diff(status) != 0) | (np.diff(seconds) > 3 * half)
+    shown = set()
+    for run in np.split(np.arange(len(seconds)), np.flatnonzero(breaks) + 1):
+        name = names.get(int(status[run[0]]), "")
         if name in SHADES:
             label = None if name in shown else name
             shown.add(name)
-            axes.axvspan(t - half, t + half, color=SHADES[name], alpha=0.4, lw=0, label=label)
+            first, last = float(seconds[run[0]] - half), float(seconds[run[-1]] + half)
+            axes.axvspan(first, last, color=SHADES[name], alpha=0.4, lw=0, label=label)
 
 
 def _cloud(axes, points, path) -> None:
@@ -113,4 +141,3 @@ def _cloud(axes, points, path) -> None:
     margin = 0.2 * (high - low) + 1e-9
     good = ((points > low - margin) & (points < high + margin)).all(axis=1)
     axes.plot(*points[good].T, ".", color="#999999", ms=1.5, alpha=0.5, label="points", zorder=0)
-

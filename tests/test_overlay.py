@@ -1,3 +1,4 @@
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,9 +32,14 @@ def project(camera, X):
     return np.asarray(camera.to_pixels(jnp.asarray(X[:, :2] / X[:, 2:])))
 
 
-def near(pixels, image_pixels):
-    """Distance from each image pixel (u, v) to the nearest of the pixels."""
-    return np.linalg.norm(image_pixels[:, None] - pixels, axis=-1).min(axis=1)
+def near(pixels, others):
+    """Distance from each of the other pixels (u, v) to the nearest of the pixels, all rounded."""
+    mask = np.ones((240, 320), np.uint8)
+    u, v = np.round(pixels).astype(int).T
+    inside = (u >= 0) & (u < 320) & (v >= 0) & (v < 240)
+    mask[v[inside], u[inside]] = 0
+    u, v = np.round(others).astype(int).T
+    return cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[v, u]
 
 
 def drawn(image):
@@ -54,7 +60,7 @@ def test_the_car_is_drawn_where_the_camera_sees_it(camera):
     expected = project(camera, X)
     assert ((expected > 0) & (expected < [320, 240])).all()
     assert near(drawn(image), expected).max() < 1
-    share = np.linspace(0, 1, 25)[:, None, None]
+    share = np.linspace(0, 1, 40)[:, None, None]
     lines = X[wireframe.edges[:, 0]] * (1 - share) + X[wireframe.edges[:, 1]] * share
     assert near(project(camera, lines.reshape(-1, 3)), drawn(image)).max() < 3
 

@@ -92,8 +92,12 @@ def test_what_is_behind_or_turned_away_is_not_seen():
     assert np.isinf(depth[:120]).all()
 
 
-def test_laboratory_is_a_rig_sliding_sideways():
-    footage = laboratory()
+@pytest.fixture(scope="module")
+def footage():
+    return laboratory()
+
+
+def test_laboratory_is_a_rig_sliding_sideways(footage):
     T = footage.T_world_camera
     assert T.shape == (100, 4, 4)
     np.testing.assert_allclose(T[0], np.eye(4), atol=1e-12)
@@ -102,8 +106,8 @@ def test_laboratory_is_a_rig_sliding_sideways():
     assert 0.1 < np.degrees(np.abs(np.asarray(angles))).max() < 1
 
 
-def test_tracked_features_move_as_the_depth_and_the_poses_say():
-    scene, camera, _, T_world_camera = laboratory(9)
+def test_tracked_features_move_as_the_depth_and_the_poses_say(footage):
+    scene, camera, _, T_world_camera = footage
     images = list(rendered_sequence(scene, camera, T_world_camera[[0, 8]], noise_gray=1.0))
     first, last = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images)
     pixels = cv2.goodFeaturesToTrack(first, 300, 0.01, 8)[:, 0]

@@ -52,9 +52,7 @@ def paper_experiment(
     shift = jnp.where(segment[:, None] == 1, 0.0, shift)
     turn = jnp.where(segment[:, None] == 0, 0.0, turn)
 
-    def move(
-        carry: tuple[SO3, Array], rates: tuple[Array, Array]
-    ) -> tuple[tuple[SO3, Array], tuple[Array, Array]]:
+    def move(carry: tuple[SO3, Array], rates: tuple[Array, Array]) -> tuple[tuple[SO3, Array], tuple[Array, Array]]:
         rotation, position = carry
         rotation = (SO3.exp(rates[0]) @ rotation).normalize()
         position = position + rates[1]

@@ -156,7 +156,7 @@ class KLT:
         for x, y in self._pixels[self._alive]:
             cv2.circle(mask, (round(float(x)), round(float(y))), int(s.spacing), 0, -1)
         corners = cv2.goodFeaturesToTrack(
-            gray, 4 * s.capacity, s.quality, s.spacing, mask=mask, blockSize=5, useHarrisDetector=False
+            gray, 0, s.quality, s.spacing, mask=mask, blockSize=5, useHarrisDetector=False
         )
         fresh = np.zeros(s.capacity, bool)
         if corners is None:  # a blank image

@@ -126,11 +126,12 @@ def draw_tracks(
 
 
 def draw_text(image: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with a line of text at its lower left."""
+    """The image with a line of text on a dark band at its lower left."""
     out = image.copy()
-    at, font, size = (10, image.shape[0] - 12), cv2.FONT_HERSHEY_SIMPLEX, 0.5
-    for colour, width in (((20, 20, 20), 3), ((255, 255, 255), 1)):
-        cv2.putText(out, text, at, font, size, colour, width, cv2.LINE_AA)
+    font, size, h = cv2.FONT_HERSHEY_SIMPLEX, 0.5, image.shape[0]
+    (width, height), below = cv2.getTextSize(text, font, size, 1)
+    cv2.rectangle(out, (0, h - height - below - 10), (width + 20, h), (30, 30, 30), -1)
+    cv2.putText(out, text, (10, h - below - 5), font, size, (255, 255, 255), 1, cv2.LINE_AA)
     return out
 
 
@@ -185,8 +186,8 @@ def place(
     """Where an object of length 1 stands: a similarity `T_world_object` on the dominant plane.
 
     Seen from the camera `T_world_camera` it stands at `pixel`, or among the plane's points near the middle of
-    the image (lower, where the plane lies below the camera), and is `size` of the image wide; on a wall it stands out of it. Raises `InputError` where
-    there is no plane, or the pixel does not meet it.
+    the image (lower, where the plane lies below the camera), and is `size` of the image wide; on a wall it
+    stands out of it. Raises `InputError` where there is no plane, or the pixel does not meet it.
     """
     centre, R = T_world_camera[:3, 3], T_world_camera[:3, :3]
     seen = (points - centre) @ R

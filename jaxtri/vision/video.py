@@ -66,9 +66,7 @@ class FrameSource:
             raise
         if self._first is None:
             reader.close()
-            raise VideoError(
-                f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1])
-            )
+            raise VideoError(f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1]))
         self.size = _size(self._first)
 
     def _read(self) -> Frame | None:
@@ -127,9 +125,7 @@ class FrameSource:
         self.close()
 
 
-def open_source(
-    source: str | os.PathLike[str] | int, *, fps: float | None = None, strict: bool = False
-) -> FrameSource:
+def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = None, strict: bool = False) -> FrameSource:
     """Open a video file, a folder of images, or a camera by its number (an integer or, say, "0").
 
     A folder gives its images in natural order ("2" before "10"), or those of its subfolder `frames` if it has
@@ -174,20 +170,14 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
     with atomic_path(path) as temporary:
         writer = cv2.VideoWriter()
         with quiet():
-            if not any(
-                writer.open(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, (w, h)) for codec in codecs
-            ):
-                raise VideoError(
-                    f"{path}: none of the codecs {', '.join(codecs)} opens; try a name in .mp4 or .avi"
-                )
+            if not any(writer.open(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, (w, h)) for codec in codecs):
+                raise VideoError(f"{path}: none of the codecs {', '.join(codecs)} opens; try a name in .mp4 or .avi")
         count = 0
         try:
             image: np.ndarray | None = first
             while image is not None:
                 if image.shape != (h, w, 3):
-                    raise ResolutionChangeError(
-                        f"{path}: frame {count} has shape {image.shape}, the first {(h, w, 3)}"
-                    )
+                    raise ResolutionChangeError(f"{path}: frame {count} has shape {image.shape}, the first {(h, w, 3)}")
                 writer.write(np.ascontiguousarray(image))
                 count += 1
                 image = next(frames, None)
