@@ -74,10 +74,8 @@ def dinosaur(folder: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    options = parser(__doc__.splitlines()[0], data=True)
-    options.add_argument(
-        "--bases", nargs="+", default=[b.value for b in Base], help="kinds of base to compare"
-    )
+    options = parser("How far is the recovered trajectory from the truth on real video?", data=True)
+    options.add_argument("--bases", nargs="+", default=[b.value for b in Base], help="kinds of base to compare")
     args = options.parse_args()
     folders = [args.data / name for name in [*PEERS, ROTATION] if (args.data / name).is_dir()]
     if not folders:
@@ -136,10 +134,9 @@ def main() -> None:
         ]
         print(f"\nbase: {kind}\n" + table(head + list(NAMES), rows))
         if ratios:
-            figures[f"{prefix}geomean_ate_vs_pnp"] = float(np.exp(np.mean(np.log(ratios))))
-            print(
-                f"geometric mean of ATE / pnp over {len(ratios)} sequences: {figures[f'{prefix}geomean_ate_vs_pnp']:.3f}"
-            )
+            mean = float(np.exp(np.mean(np.log(ratios))))
+            figures[f"{prefix}geomean_ate_vs_pnp"] = mean
+            print(f"geometric mean of ATE / pnp over {len(ratios)} sequences: {mean:.3f}")
         print(f"{ROTATION}: {ROTATION_PEERS}\n", flush=True)
     circle = args.data / "tracks_oxford_dinosaur"
     if circle.is_dir():

@@ -1,7 +1,7 @@
 """The two ways to choose base frames, behind one interface for the driver: per track, or one pair for all."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, NamedTuple, Protocol
 
@@ -49,7 +49,8 @@ class StartSettings:
         return cls(**changes)
 
 
-class Frame(NamedTuple):
+@dataclass(frozen=True)
+class Frame:
     """The tracks of one frame, normalised, in slots."""
 
     index: int
@@ -89,16 +90,12 @@ def find(settings: Settings, start: StartSettings, frames: list[Frame]) -> Start
     first, last = frames[0], frames[-1]
     common = first.common(last)
     if common.sum() < start.points:
-        return Start(
-            None, f"only {int(common.sum())} tracks are common to two frames, {start.points} are needed"
-        )
+        return Start(None, f"only {int(common.sum())} tracks are common to two frames, {start.points} are needed")
     threshold = float(settings.epipolar_gate)
     found = hypotheses(first.u, last.u, common, settings.sigma, threshold, eight_point=start.eight_point)
     if not found:
         return Start(None, "no essential matrix fits the tracks")
-    between = [
-        frames[int(k)] for k in np.linspace(0, len(frames) - 1, 5).round()[1:-1] if 0 < k < len(frames) - 1
-    ]
+    between = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, 5).round()[1:-1] if 0 < k < len(frames) - 1]
     rivals = [h for h in found if h.cost < 1.5 * found[0].cost + 50]
     if between and len(rivals) > 1:
         rivals.sort(key=lambda h: h.cost + _transfer_cost(settings, h, first, last, between))
@@ -106,15 +103,11 @@ def find(settings: Settings, start: StartSettings, frames: list[Frame]) -> Start
     if best.inside.sum() < max(start.points, 0.4 * common.sum()):
         return Start(None, f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion")
     if not best.parallax_deg >= start.parallax_deg:
-        return Start(
-            None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed"
-        )
+        return Start(None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed")
     return Start(best.pose, "")
 
 
-def _transfer_cost(
-    settings: Settings, h: Hypothesis, first: Frame, last: Frame, between: list[Frame]
-) -> float:
+def _transfer_cost(settings: Settings, h: Hypothesis, first: Frame, last: Frame, between: list[Frame]) -> float:
     """Truncated squared distances of the points transferred to the frames between the pair."""
     pose = compose(h.pose.rotation, h.pose.translation)
     arrays = jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(h.inside)
@@ -160,9 +153,7 @@ def hold(
 ) -> tuple[tracker.State, Report]:
     """One frame measured with the tracks as they are: none begins, no keyframe is made."""
     none = jnp.zeros(len(visible), bool)
-    return _step(
-        settings, state, jnp.asarray(frame.u), jnp.asarray(visible), none, dt, hold=jnp.asarray(True)
-    )
+    return _step(settings, state, jnp.asarray(frame.u), jnp.asarray(visible), none, dt, hold=jnp.asarray(True))
 
 
 @jax.jit
@@ -439,10 +430,4 @@ def scaled(two_view: TwoView, length: Float[Array, ""] | float) -> TwoView:
     """The same relative pose with its translation multiplied by `length`."""
     C = two_view.covariance
     s = jnp.concatenate([jnp.full(3, length, C.dtype), jnp.ones(3, C.dtype)])
-    return two_view.__class__(
-        two_view.translation * length,
-        two_view.rotation,
-        C * jnp.outer(s, s),
-        two_view.rms,
-        two_view.converged,
-    )
+    return replace(two_view, translation=two_view.translation * length, covariance=C * jnp.outer(s, s))

@@ -43,6 +43,8 @@ class Track:
     """Where the car stands: pixel u v in the middle frame; on the dominant plane by default."""
     overlay: bool = True
     """Write overlay.mp4."""
+    recording: bool = False
+    """Write recording.rrd for the rerun viewer (extra `viewer`)."""
     strict: bool = False
     """Fail on a truncated source instead of warning."""
     quiet: bool = False
@@ -105,7 +107,6 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
         print(f"jaxtri: warning: {message}", file=sys.stderr)
 
 
-
 def _track(options: Track) -> None:
     from jaxtri.results import write_overlay, write_results
     from jaxtri.vision.video import open_source
@@ -119,7 +120,13 @@ def _track(options: Track) -> None:
         frames: Any = _spooled(source, options.out / "frames") if live else source
         run = _run(frames, camera, base, options)
         fps = source.fps
-    paths = write_results(run, options.out, {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()})
+    paths = write_results(
+        run, options.out, {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
+    )
+    if options.recording:
+        from jaxtri.vision.viewer import write_recording
+
+        paths.append(write_recording(run, camera, options.out / "recording.rrd"))
     if options.overlay:
         again = options.out / "frames" if live else options.source
         with warnings.catch_warnings(), open_source(again, fps=options.fps) as source:
@@ -149,10 +156,10 @@ def _camera(options: Track, size: tuple[int, int]) -> Any:
     from jaxtri.geometry.camera import Camera
     from jaxtri.io import read_camera
 
-    if (options.camera is None) == (options.fov is None):
-        raise CameraError("give the intrinsics: --camera FILE, or a guess of the field of view by --fov DEGREES")
-    if options.camera is not None:
+    if options.camera is not None and options.fov is None:
         return read_camera(options.camera, width=size[0], height=size[1])
+    if options.camera is not None or options.fov is None:
+        raise CameraError("give the intrinsics: --camera FILE, or a guess of the field of view by --fov DEGREES")
     return Camera.from_fov(options.fov, *size)
 
 
@@ -223,8 +230,8 @@ def _print_errors(found: Any) -> None:
 def _demo(options: Demo) -> None:
     from jaxtri.io import read_tum
     from jaxtri.results import write_overlay, write_results
-    from jaxtri.vision.rendered import write_laboratory
     from jaxtri.trajectory import evaluate
+    from jaxtri.vision.rendered import write_laboratory
     from jaxtri.vision.video import open_source
 
     if options.frames < 2:

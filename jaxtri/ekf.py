@@ -127,9 +127,7 @@ def _stand_in(mask: Bool[Array, " n"], items: PyTree) -> PyTree:
     return jax.tree.map(replace, items)
 
 
-def _linearise(
-    model: Model, prior: Mean, delta: Array, items: PyTree, observed: Array, mask: Array
-) -> _Linearisation:
+def _linearise(model: Model, prior: Mean, delta: Array, items: PyTree, observed: Array, mask: Array) -> _Linearisation:
     """Residual, Jacobian with respect to the error of the *prior*, and noise, at `retract(prior, delta)`."""
 
     def predicted(error: Array) -> Array:

@@ -320,9 +320,7 @@ def _rows(
             row = []
         if len(row) != columns or not all(map(math.isfinite, row)):
             number_word = "number" if columns == 1 else "numbers"
-            raise error(
-                f"{path}:{number}: expected {columns} finite {number_word} ({meaning}), got {line[:200]!r}"
-            )
+            raise error(f"{path}:{number}: expected {columns} finite {number_word} ({meaning}), got {line[:200]!r}")
         lines.append(number)
         rows.append(row)
     if not rows:

@@ -84,9 +84,7 @@ class Odometry:
 
     def __post_init__(self) -> None:
         if self.camera.width is None:
-            raise InputError(
-                "the camera has no image width: set it, the thresholds of the tracker scale with it"
-            )
+            raise InputError("the camera has no image width: set it, the thresholds of the tracker scale with it")
         self._settings = self.settings or Settings.of(self.camera)
         self._start = self.start or StartSettings.of(self.base)
         self._waiting: list[Frame] = []  # frames that may still become a base pair

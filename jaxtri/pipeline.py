@@ -77,9 +77,7 @@ def track(
             clock = time.perf_counter()
             follower.drop(tracker.add(tracks, frame.time_s))
             seconds["filter"] += time.perf_counter() - clock
-            bar.set_postfix_str(
-                f"{tracker.status.name.lower()}, {tracker.poses[-1].used} points", refresh=False
-            )
+            bar.set_postfix_str(f"{tracker.status.name.lower()}, {tracker.poses[-1].used} points", refresh=False)
             bar.update()
             if max_frames is not None and len(tracker.poses) >= max_frames:
                 break
@@ -116,9 +114,7 @@ def follow_tracks(
     NaN where a track is not seen is as good as False. `times` (t,) in seconds, by default the frame number.
     """
     if pixels.ndim != 3 or pixels.shape[2] != 2 or visible.shape != pixels.shape[:2]:
-        raise InputError(
-            f"tracks of shape {pixels.shape} with visible {visible.shape}: give (t, n, 2) and (t, n)"
-        )
+        raise InputError(f"tracks of shape {pixels.shape} with visible {visible.shape}: give (t, n, 2) and (t, n)")
     times = np.arange(len(pixels), dtype=float) if times is None else times
     odometry = Odometry(camera, settings, base, start)
     ids, nothing = np.arange(pixels.shape[1]), np.zeros(pixels.shape[1])

@@ -2,7 +2,7 @@
 
 import importlib.metadata
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,9 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in PACKAGES}
 
 
-def write_results(run: Run, out: Path, settings: dict[str, object], reference: Trajectory | None = None) -> list[Path]:
+def write_results(
+    run: Run, out: Path, settings: Mapping[str, object], reference: Trajectory | None = None
+) -> list[Path]:
     """Write trajectory.txt, trajectory.png, points.ply and run.json; returns their paths.
 
     `reference` is the truth in the frame and scale of the run, for the plot.
@@ -35,7 +37,9 @@ def write_results(run: Run, out: Path, settings: dict[str, object], reference: T
     paths = [out / name for name in ("trajectory.txt", "trajectory.png", "points.ply", "run.json")]
     status = run.trajectory.status
     assert status is not None
-    unsure = [f"{NAMES[code]}: frames {_ranges(status == code)}" for code in NAMES if code != 1 and (status == code).any()]
+    unsure = [
+        f"{NAMES[code]}: frames {_ranges(status == code)}" for code in NAMES if code != 1 and (status == code).any()
+    ]
     header = "timestamp tx ty tz qx qy qz qw   camera to world, camera x right y down z forward, scale: gauge"
     write_tum(paths[0], run.trajectory, "\n".join([header, *unsure]))
     figure = plot_trajectory(

@@ -147,9 +147,7 @@ def init(
     depth = median(1 / jnp.where(good, base.point[:, 3], 1.0), good)
     kept = start(one, two, jnp.zeros((6, 6), dtype) if covariance is None else covariance, keyframes)
     # The first pose is the gauge; the velocity is all but unknown.
-    sd = jnp.repeat(
-        jnp.stack([1e-6 * depth, jnp.asarray(1e-6, dtype), 0.05 * depth, jnp.asarray(0.05, dtype)]), 3
-    )
+    sd = jnp.repeat(jnp.stack([1e-6 * depth, jnp.asarray(1e-6, dtype), 0.05 * depth, jnp.asarray(0.05, dtype)]), 3)
     belief = ekf.Belief(Twist(one, jnp.zeros(6, dtype)), jnp.diag(sd**2))
     slots = jnp.stack([jnp.where(mask, 0, -1), jnp.where(good, 1, -1)], axis=-1).astype(jnp.int32)
     tracks = Tracks(first, slots, base, lever, good, good)
@@ -304,6 +302,4 @@ def filter(
     """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan."""
     if dt is None:
         dt = jnp.ones(observed.shape[0], observed.dtype)
-    return jax.lax.scan(
-        lambda carry, frame: step(settings, carry, *frame), state, (observed, visible, fresh, dt)
-    )
+    return jax.lax.scan(lambda carry, frame: step(settings, carry, *frame), state, (observed, visible, fresh, dt))

@@ -39,9 +39,7 @@ class Trajectory:
                 continue
             value = np.asarray(value, np.int64 if name == "status" else np.float64)
             if value.shape != (t, *shape):
-                raise TrajectoryError(
-                    f"{name} has shape {value.shape}; with {t} times it must be {(t, *shape)}"
-                )
+                raise TrajectoryError(f"{name} has shape {value.shape}; with {t} times it must be {(t, *shape)}")
             bad = np.flatnonzero(~np.isfinite(value.reshape(t, -1)).all(-1))
             if len(bad):
                 raise TrajectoryError(f"{name}[{bad[0]}] is not finite; leave out the poses that are unknown")
@@ -310,9 +308,7 @@ def _norm(x: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
 
 
 def _vee(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
-    return jnp.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
-    )
+    return jnp.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
 
 
 def _angle(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:

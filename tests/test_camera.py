@@ -20,9 +20,7 @@ to_normalised = jax.jit(Camera.to_normalised)
 
 
 def camera(distortion, skew=0.0, dtype=None):
-    return Camera.from_parameters(
-        420.5, 421.7, 355.2, 250.3, skew=skew, distortion=distortion, dtype=dtype, **SIZE
-    )
+    return Camera.from_parameters(420.5, 421.7, 355.2, 250.3, skew=skew, distortion=distortion, dtype=dtype, **SIZE)
 
 
 def pixel_grid():
@@ -107,8 +105,7 @@ def test_derivatives_of_every_leaf_are_those_of_central_differences(distortion):
         for exact, p, m, atol in zip(pushed, plus, minus, (1e-9, 1e-6), strict=True):
             np.testing.assert_allclose(exact, (np.asarray(p) - np.asarray(m)) / (2 * h), rtol=1e-6, atol=atol)
         dots = [
-            sum(np.vdot(a, b) for a, b in zip(*pair, strict=True))
-            for pair in ((pulled, direction), (pushed, weights))
+            sum(np.vdot(a, b) for a, b in zip(*pair, strict=True)) for pair in ((pulled, direction), (pushed, weights))
         ]
         np.testing.assert_allclose(*dots, rtol=1e-9)
 

@@ -111,7 +111,9 @@ def test_sequences_without_motion_say_so(kind, sequence, tmp_path, capsys):
     frames.mkdir()
     for k in range(1 if kind == "one frame" else 6):
         cv2.imwrite(str(frames / f"{k}.png"), image)
-    message = fails(["track", frames, "--camera", sequence / "camera.json", "--out", tmp_path / "out", "--quiet"], capsys)
+    message = fails(
+        ["track", frames, "--camera", sequence / "camera.json", "--out", tmp_path / "out", "--quiet"], capsys
+    )
     assert {"blank": "features", "static": "flow", "one frame": "at least two"}[kind] in message
     assert not (tmp_path / "out").exists()
 
@@ -146,7 +148,9 @@ def test_evaluate_names_what_is_wrong(tmp_path, capsys):
 def test_the_installed_command_has_help():
     done = subprocess.run([sys.executable, "-m", "jaxtri.cli", "--help"], capture_output=True, text=True, check=False)
     assert done.returncode == 0
-    assert {"track", "evaluate", "demo"} <= set(done.stdout.replace(",", " ").replace("{", " ").replace("}", " ").split())
+    assert {"track", "evaluate", "demo"} <= set(
+        done.stdout.replace(",", " ").replace("{", " ").replace("}", " ").split()
+    )
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"the real sequences are not at {DATA}")

@@ -100,7 +100,7 @@ def test_too_few_points_wait():
     visible = tracks.visible.copy()
     visible[:, 6:] = False
     odometry = follow_tracks(tracks.camera, tracks.pixels, visible)
-    with pytest.raises(InitialisationError, match="features|tracks"):
+    with pytest.raises(InitialisationError, match=r"features|tracks"):
         odometry.trajectory()
 
 

@@ -96,9 +96,7 @@ def test_metrics_agree_with_evo(with_scale):
     np.testing.assert_allclose(trajectory(reference).path_length, length)
     np.testing.assert_allclose(result.ate_percent, 100 * ate_expected / length, rtol=1e-10)
     mean_step = length / (len(reference) - 1)
-    np.testing.assert_allclose(
-        result.rpe_translation_percent, 100 * result.rpe_translation / mean_step, rtol=1e-10
-    )
+    np.testing.assert_allclose(result.rpe_translation_percent, 100 * result.rpe_translation / mean_step, rtol=1e-10)
     assert (result.matched, result.coverage) == (12, 1.0)
 
 

@@ -43,7 +43,13 @@ def rotation(axis_angle: np.ndarray) -> np.ndarray:
 
 
 def make(
-    centres: np.ndarray, turns: np.ndarray, *, noise_px: float = 0.3, plane: bool = False, seed: int = 0, depth: float = 4.0
+    centres: np.ndarray,
+    turns: np.ndarray,
+    *,
+    noise_px: float = 0.3,
+    plane: bool = False,
+    seed: int = 0,
+    depth: float = 4.0,
 ) -> Tracks:
     """Tracks of points around `depth` seen from cameras at `centres` (t, 3), turned by the vectors `turns` (t, 3)."""
     rng = np.random.default_rng(seed)

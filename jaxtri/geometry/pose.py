@@ -39,9 +39,7 @@ def exp_pose(xi: Float[Array, "6"]) -> SE3:
     small = x < 0.01
     safe = jnp.where(small, 1.0, x)
     angle = jnp.sqrt(safe)
-    once = jnp.where(
-        small, (1 - x / 12 * (1 - x / 30 * (1 - x / 56))) / 2, 2 * jnp.sin(angle / 2) ** 2 / safe
-    )
+    once = jnp.where(small, (1 - x / 12 * (1 - x / 30 * (1 - x / 56))) / 2, 2 * jnp.sin(angle / 2) ** 2 / safe)
     twice = (1 - x / 20 * (1 - x / 42 * (1 - x / 72))) / 6
     twice = jnp.where(small, twice, (angle - jnp.sin(angle)) / (safe * angle))
     turned = jnp.cross(theta, rho)
@@ -96,10 +94,7 @@ def local(point: Point, other: Point) -> Float[Array, " d"]:
     leaves = jax.tree.leaves(point, is_leaf=_is_group)
     others = jax.tree.leaves(other, is_leaf=_is_group)
     return jnp.concatenate(
-        [
-            _log(b @ a.inverse()) if _is_group(a) else (b - a).ravel()
-            for a, b in zip(leaves, others, strict=True)
-        ]
+        [_log(b @ a.inverse()) if _is_group(a) else (b - a).ravel() for a, b in zip(leaves, others, strict=True)]
     )
 
 

@@ -18,9 +18,7 @@ def tensor(P2: Float[Array, "3 4"], P3: Float[Array, "3 4"]) -> Float[Array, "3 
     return jnp.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]) - jnp.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
 
 
-def transfer_by_tensor(
-    T: Float[Array, "3 3 3"], u1: Float[Array, "2"], line2: Float[Array, "3"]
-) -> Float[Array, "3"]:
+def transfer_by_tensor(T: Float[Array, "3 3 3"], u1: Float[Array, "2"], line2: Float[Array, "3"]) -> Float[Array, "3"]:
     """Homogeneous point of view 3: u''^k = u^i l'_j T_i^jk. Source: Yu et al. 2006, eq. 7."""
     return jnp.einsum("i,j,ijk->k", homogeneous(u1), line2, T)
 

@@ -27,16 +27,12 @@ class Kinematics(eqx.Module):
             rotation = (SO3.exp(turn) @ self.rotation).normalize()
         else:
             rotation = self.rotation + turn
-        return Kinematics(
-            self.translation + self.velocity * dt, self.velocity, rotation, self.angular_velocity
-        )
+        return Kinematics(self.translation + self.velocity * dt, self.velocity, rotation, self.angular_velocity)
 
     @property
     def R(self) -> Float[Array, "3 3"]:
         """Rotation matrix, world to camera."""
-        return (
-            self.rotation.as_matrix() if isinstance(self.rotation, SO3) else matrix_from_euler(self.rotation)
-        )
+        return self.rotation.as_matrix() if isinstance(self.rotation, SO3) else matrix_from_euler(self.rotation)
 
 
 class Twist(eqx.Module):
@@ -68,12 +64,8 @@ def acceleration_noise(
     return jnp.block([[linear**2 * block, zero], [zero, angular**2 * block]])
 
 
-def twist_noise(
-    linear: Float[Array, ""], angular: Float[Array, ""], dt: Float[Array, ""]
-) -> Float[Array, "12 12"]:
+def twist_noise(linear: Float[Array, ""], angular: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, "12 12"]:
     """Process noise of a white acceleration in the error order of `Twist`: pose (linear, angular), then twist."""
     step = jnp.outer(jnp.stack([dt**2 / 2, dt]), jnp.stack([dt**2 / 2, dt]))
-    variances = jnp.concatenate(
-        [jnp.full(3, 1.0, step.dtype) * linear**2, jnp.full(3, 1.0, step.dtype) * angular**2]
-    )
+    variances = jnp.concatenate([jnp.full(3, 1.0, step.dtype) * linear**2, jnp.full(3, 1.0, step.dtype) * angular**2])
     return jnp.kron(step, jnp.diag(variances))

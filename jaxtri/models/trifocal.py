@@ -5,6 +5,8 @@ differ in what they hold, not in what they do: `default` (SO(3), base noise in R
 (yaw-pitch-roll, constant R, one pass) and, later, a consistent one.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,18 @@ from jaxtri.geometry.pose import euler_from_matrix, local, retract, rotation_mat
 from jaxtri.geometry.trifocal import transfer
 from jaxtri.models.motion import Kinematics, acceleration_noise
 from jaxtri.two_view import TwoView
+
+
+class Mode(NamedTuple):
+    """What the modes of the filter differ in; pass each part where its name stands."""
+
+    euler: bool  # the paper's yaw, pitch and roll instead of SO(3): `start`
+    base_noise: bool  # the noise of the base points in R instead of a constant R: `Trifocal`
+    passes: int  # linearisations of an update: `ekf.filter`
+
+
+DEFAULT = Mode(euler=False, base_noise=True, passes=4)
+PAPER = Mode(euler=True, base_noise=False, passes=1)
 
 
 class TrifocalState(eqx.Module):
@@ -116,13 +130,7 @@ def start(
     E = jnp.zeros((18, 6), dtype).at[jnp.array([0, 1, 2, 6, 7, 8]), jnp.arange(6)].set(1)
     E = E.at[jnp.arange(12, 18), jnp.arange(6)].set(1)
     E = E.at[jnp.array([3, 4, 5, 9, 10, 11]), jnp.arange(6)].set(1 / frames)
-    variance = (
-        jnp.zeros(18, dtype)
-        .at[3:6]
-        .set(jnp.square(velocity_sd))
-        .at[9:12]
-        .set(jnp.square(angular_velocity_sd))
-    )
+    variance = jnp.zeros(18, dtype).at[3:6].set(jnp.square(velocity_sd)).at[9:12].set(jnp.square(angular_velocity_sd))
     return Belief(state, E @ C @ E.T + jnp.diag(variance))
 
 

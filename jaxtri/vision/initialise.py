@@ -36,9 +36,7 @@ def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_p
             if eight_point:
                 E = _eight_point(u1, u2, threshold)
             else:
-                E, _ = cv2.findEssentialMat(
-                    u1, u2, np.eye(3), method=method, prob=0.9999, threshold=threshold
-                )
+                E, _ = cv2.findEssentialMat(u1, u2, np.eye(3), method=method, prob=0.9999, threshold=threshold)
         except cv2.error:  # a degenerate sample: no hypothesis
             continue
         if E is None or not np.isfinite(E).all():
@@ -48,6 +46,21 @@ def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_p
             _, R, T, _, _ = cv2.recoverPose(stacked, u1, u2, np.eye(3), distanceThresh=1e9)
             found.append((R, T.ravel()))
     return found
+
+
+def poselib_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:
+    """The relative pose (R, T) by PoseLib's LO-RANSAC, where it is installed (extra `init`); else empty."""
+    try:
+        import poselib
+    except ImportError:
+        return []
+    # In pixels of a focal length of 1000: PoseLib's refinement is scaled for pixels.
+    camera = {"model": "PINHOLE", "width": 2000, "height": 2000, "params": [1000.0, 1000.0, 0.0, 0.0]}
+    options = {"max_epipolar_error": 1000 * threshold}
+    pose, _ = poselib.estimate_relative_pose(1000 * u1, 1000 * u2, camera, camera, options, {})
+    length = np.linalg.norm(pose.t)
+    found = np.isfinite(pose.R).all() and np.isfinite(length) and length > 1e-9
+    return [(np.asarray(pose.R), np.asarray(pose.t) / length)] if found else []
 
 
 def _eight_point(u1: np.ndarray, u2: np.ndarray, threshold: float) -> np.ndarray | None:
@@ -137,7 +150,7 @@ def hypotheses(
         return []
     poses = essential_poses(a, b, threshold, eight_point=eight_point)
     if not eight_point:
-        poses += homography_poses(a, b, threshold)
+        poses += poselib_poses(a, b, threshold) + homography_poses(a, b, threshold)
     if not poses:
         return []
     poses = (poses + [poses[0]] * HYPOTHESES)[:HYPOTHESES]
@@ -145,9 +158,7 @@ def hypotheses(
     first, second = (jnp.asarray(np.where(mask[:, None], u, 0), sigma.dtype) for u in (u1, u2))
     common = jnp.asarray(mask)
     rough = _refine(R, T, first, second, jnp.broadcast_to(common, (HYPOTHESES, len(mask))), common, sigma)
-    fine = _refine(
-        rough.pose.rotation.as_matrix(), rough.pose.translation, first, second, rough.inside, common, sigma
-    )
+    fine = _refine(rough.pose.rotation.as_matrix(), rough.pose.translation, first, second, rough.inside, common, sigma)
     cost = np.where(np.isfinite(np.asarray(fine.cost)), np.asarray(fine.cost), np.inf)
     found: list[Hypothesis] = []
     for k in np.argsort(cost):

@@ -90,9 +90,7 @@ class KLT:
         self._previous = gray
         used = set(self._anchor[self._alive].tolist())
         self._anchors = {k: v for k, v in self._anchors.items() if k in used}
-        return FrameTracks(
-            self._pixels.astype(np.float64), self._alive.copy(), fresh, self._ids.copy(), error
-        )
+        return FrameTracks(self._pixels.astype(np.float64), self._alive.copy(), fresh, self._ids.copy(), error)
 
     def drop(self, slots: np.ndarray) -> None:
         """Give up the features of a boolean mask (n,): the filter found them to be outliers."""
@@ -136,7 +134,7 @@ class KLT:
         assert self._shape is not None
         h, w = self._shape[:2]
         margin = self.settings.window // 4
-        return ((pixels >= margin) & (pixels < np.array([w, h]) - margin)).all(axis=1)
+        return np.all((pixels >= margin) & (pixels < np.array([w, h]) - margin), axis=1)
 
     def _separate(self) -> None:
         """Of features that have run into each other only the oldest stays."""
@@ -181,9 +179,7 @@ class KLT:
         g = self.settings.cells
 
         def cell(p: np.ndarray) -> np.ndarray:
-            return (p[:, 1] * g / h).astype(int).clip(0, g - 1) * g + (p[:, 0] * g / w).astype(int).clip(
-                0, g - 1
-            )
+            return (p[:, 1] * g / h).astype(int).clip(0, g - 1) * g + (p[:, 0] * g / w).astype(int).clip(0, g - 1)
 
         held = np.bincount(cell(self._pixels[self._alive]), minlength=g * g)
         cells = cell(corners)

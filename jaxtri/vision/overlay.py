@@ -70,7 +70,7 @@ def draw_wireframe(
     T_world_object: Float[np.ndarray, "4 4"],
     wireframe: Wireframe,
     *,
-    colour: tuple[int, int, int] = (60, 220, 255),
+    colour: tuple[int, int, int] = (50, 70, 255),
     thickness: int = 2,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The image with the wire frame drawn into it, lens distortion included.

@@ -24,7 +24,9 @@ def write_laboratory(folder: Path, n_frames: int = 100, seed: int = 0, *, progre
             cv2.imwrite(str(temporary), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
     with atomic_path(folder / "timestamps.txt") as temporary:
         temporary.write_text("".join(f"{t:.6f} {name}\n" for t, name in zip(times, names, strict=True)))
-    write_tum(folder / "groundtruth.txt", Trajectory(np.asarray(times, np.float64), np.asarray(T_world_camera, np.float64)))
+    write_tum(
+        folder / "groundtruth.txt", Trajectory(np.asarray(times, np.float64), np.asarray(T_world_camera, np.float64))
+    )
     intrinsics = {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
     write_json(
         folder / "camera.json",
