@@ -3,6 +3,7 @@
 import sys
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -108,6 +109,7 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 
 
 def _track(options: Track) -> None:
+    from jaxtri.pipeline import warm_up
     from jaxtri.results import write_overlay, write_results
     from jaxtri.vision.video import open_source
 
@@ -117,6 +119,8 @@ def _track(options: Track) -> None:
         print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
     with open_source(options.source, fps=options.fps, strict=options.strict) as source:
         camera = _camera(options, source.size)
+        if live:
+            warm_up(camera, **_options(camera, base, options))
         frames: Any = _spooled(source, options.out / "frames") if live else source
         run = _run(frames, camera, base, options)
         fps = source.fps
@@ -164,22 +168,25 @@ def _camera(options: Track, size: tuple[int, int]) -> Any:
 
 
 def _run(frames: Any, camera: Any, base: Any, options: Track) -> Any:
-    from jaxtri.bases import StartSettings
     from jaxtri.pipeline import track
+
+    progress = not options.quiet
+    return track(frames, camera, progress=progress, max_frames=options.max_frames, **_options(camera, base, options))
+
+
+def _options(camera: Any, base: Any, options: Track) -> dict[str, Any]:
+    """The keyword arguments of `pipeline.track` and `pipeline.warm_up`."""
+    from jaxtri.bases import StartSettings
     from jaxtri.tracker import Settings
     from jaxtri.vision.klt import KLTSettings
 
     changes = {} if options.min_parallax is None else {"parallax_deg": options.min_parallax}
-    return track(
-        frames,
-        camera,
-        base=base,
-        settings=Settings.of(camera, noise_px=options.noise_px),
-        start=StartSettings.of(base, overlap=options.overlap, **changes),
-        klt=KLTSettings(capacity=options.features),
-        progress=not options.quiet,
-        max_frames=options.max_frames,
-    )
+    return {
+        "base": base,
+        "settings": Settings.of(camera, noise_px=options.noise_px),
+        "start": StartSettings.of(base, overlap=options.overlap, **changes),
+        "klt": KLTSettings(capacity=options.features),
+    }
 
 
 def _spooled(frames: Any, folder: Path) -> Iterator[Any]:
@@ -229,20 +236,26 @@ def _print_errors(found: Any) -> None:
 
 def _demo(options: Demo) -> None:
     from jaxtri.io import read_tum
+    from jaxtri.pipeline import warm_up
     from jaxtri.results import write_overlay, write_results
+    from jaxtri.synthetic import laboratory
     from jaxtri.trajectory import evaluate
-    from jaxtri.vision.rendered import write_laboratory
+    from jaxtri.vision.rendered import write_footage
     from jaxtri.vision.video import open_source
 
     if options.frames < 2:
         raise InputError(f"--frames {options.frames}: a camera's motion needs at least two")
     folder = options.out / "sequence"
     print(f"rendering {options.frames} frames of a laboratory, the camera sliding sideways before some boxes")
-    camera = write_laboratory(folder, options.frames, options.seed, progress=not options.quiet)
+    track, base = Track(str(folder), quiet=options.quiet), _base("tracks")
+    footage = laboratory(options.frames, options.seed)
+    with ThreadPoolExecutor(1) as pool:  # the filters compile while the frames are rendered
+        ready = pool.submit(warm_up, footage.camera, **_options(footage.camera, base, track))
+        camera = write_footage(folder, footage, options.seed, progress=not options.quiet)
+        ready.result()
     truth = read_tum(folder / "groundtruth.txt")
-    track = Track(str(folder), quiet=options.quiet)
     with open_source(folder) as source:
-        run = _run(source, camera, _base("tracks"), track)
+        run = _run(source, camera, base, track)
         fps = source.fps
     found = evaluate(run.trajectory, truth)
     run = run.scaled(found.scale)  # the gauge is known here: metres

@@ -99,6 +99,30 @@ def track(
     return Run(trajectory, points, rgb, tracker, statistics)
 
 
+def warm_up(
+    camera: Camera,
+    *,
+    base: Base = Base.TRACKS,
+    settings: Settings | None = None,
+    start: StartSettings | None = None,
+    klt: KLTSettings | None = None,
+) -> None:
+    """Compile what `track` needs, with the same arguments, by following a few made-up tracks.
+
+    A first run spends most of its time compiling; a camera should not wait for it, and what is rendered or
+    read meanwhile need not either.
+    """
+    n = (klt or KLTSettings()).capacity
+    rng = np.random.default_rng(0)
+    w, h = camera.width or 2 * float(camera.cx), camera.height or 2 * float(camera.cy)
+    pixels = rng.uniform([0.2 * w, 0.2 * h], [0.8 * w, 0.8 * h], (n, 2))
+    depth = rng.uniform(1, 2, n)
+    everything = np.ones((6, n), bool)
+    shift = np.zeros((6, n, 2))
+    shift[..., 0] = 0.04 * w * np.arange(6)[:, None] / depth
+    follow_tracks(camera, pixels + shift, everything, base=base, settings=settings, start=start)
+
+
 def follow_tracks(
     camera: Camera,
     pixels: np.ndarray,

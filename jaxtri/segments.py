@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import adjoint, compose, shear
+from jaxtri.geometry.pose import adjoint, compose, multiply, shear
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
 from jaxtri.tracker import Report, Settings, judge, median
 from jaxtri.two_view import TwoView
@@ -80,7 +80,7 @@ def world_pose(state: State) -> tuple[SE3, Float[Array, "6 6"]]:
     T = motion.translation
     scale = jnp.concatenate([T, jnp.zeros_like(T)])[:, None]
     G = jnp.concatenate([adjoint(relative), scale], axis=1)
-    return relative @ state.placement.pose, own_covariance(state) + G @ state.placement.covariance @ G.T
+    return multiply(relative, state.placement.pose), own_covariance(state) + G @ state.placement.covariance @ G.T
 
 
 def own_covariance(state: State) -> Float[Array, "6 6"]:

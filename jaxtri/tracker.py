@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtri import ekf
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
+from jaxtri.geometry.pose import multiply, relative
 from jaxtri.keyframes import Keyframes, add, carry, start, total
 from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_point
 from jaxtri.models.motion import Twist
@@ -139,7 +140,7 @@ def init(
     dtype = first.dtype
     one = SE3.identity() if world is None else world
     one = jax.tree.map(lambda x: x.astype(dtype), one)
-    two = pose @ one
+    two = multiply(pose, one)
     first = jnp.where(mask[:, None], first, jnp.zeros((), dtype))
     second = jnp.where(mask[:, None], second, jnp.zeros((), dtype))
     base, lever, good, _ = jax.vmap(lambda a, b: _pair(settings, a, b, one, two))(first, second)
@@ -190,8 +191,8 @@ def _pair(
     settings: Settings, first: Float[Array, "2"], second: Float[Array, "2"], one: SE3, two: SE3
 ) -> tuple[BasePoint, Float[Array, "4 12"], Bool[Array, ""], Float[Array, ""]]:
     """The base point of a pair, its lever, whether the two views agree on it, and its parallax in radians."""
-    relative = two @ one.inverse()
-    R, T = relative.rotation().as_matrix(), relative.translation()
+    between = relative(one, two)
+    R, T = between.rotation().as_matrix(), between.translation()
     angle = parallax(first, second, R)
     distance = sampson(essential(R, T), first, second)
     ahead = inverse_depth(first, second, R, T, T) > 0

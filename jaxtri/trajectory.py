@@ -23,10 +23,11 @@ class Trajectory:
     producer's codes. Raises `TrajectoryError` naming the first entry that cannot be used.
     """
 
-    times: Float64[np.ndarray, " t"]
-    T_world_camera: Float64[np.ndarray, "t 4 4"]
-    covariance: Float64[np.ndarray, "t 6 6"] | None = None
-    status: Int[np.ndarray, " t"] | None = None
+    # Shapes are checked below, with a message of our own.
+    times: np.ndarray  # (t,) float64
+    T_world_camera: np.ndarray  # (t, 4, 4) float64
+    covariance: np.ndarray | None = None  # (t, 6, 6) float64
+    status: np.ndarray | None = None  # (t,) int
 
     def __post_init__(self):
         shapes = {"times": (), "T_world_camera": (4, 4), "covariance": (6, 6), "status": ()}

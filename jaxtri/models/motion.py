@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Float
 
-from jaxtri.geometry.pose import exp_pose, matrix_from_euler
+from jaxtri.geometry.pose import exp_pose, matrix_from_euler, multiply
 
 
 class Kinematics(eqx.Module):
@@ -47,7 +47,7 @@ class Twist(eqx.Module):
 
     def advance(self, dt: Float[Array, ""]) -> "Twist":
         """The state at constant twist `dt` later."""
-        return Twist((exp_pose(self.twist * dt) @ self.pose).normalize(), self.twist)
+        return Twist(multiply(exp_pose(self.twist * dt), self.pose).normalize(), self.twist)
 
 
 def acceleration_noise(

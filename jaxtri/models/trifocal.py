@@ -135,7 +135,10 @@ def start(
 
 
 def informative(
-    state: TrifocalState, pairs: Float[Array, "n 4"], sigma: Float[Array, ""], smallest_snr: float = 0.0
+    state: TrifocalState,
+    pairs: Float[Array, "n 4"],
+    sigma: Float[Array, ""],
+    smallest_snr: Float[Array, ""] | float = 0.0,
 ) -> Bool[Array, " n"]:
     """Pairs whose depth the base line fixes: in front of the camera, and `smallest_snr` times above its noise.
 

@@ -51,7 +51,7 @@ def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_p
 def poselib_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:
     """The relative pose (R, T) by PoseLib's LO-RANSAC, where it is installed (extra `init`); else empty."""
     try:
-        import poselib
+        import poselib  # pyright: ignore[reportMissingImports]
     except ImportError:
         return []
     # In pixels of a focal length of 1000: PoseLib's refinement is scaled for pixels.

@@ -8,14 +8,20 @@ from tqdm import tqdm
 
 from jaxtri.geometry.camera import Camera
 from jaxtri.io import atomic_path, write_json, write_tum
-from jaxtri.synthetic.laboratory import laboratory
+from jaxtri.synthetic.laboratory import Footage, laboratory
 from jaxtri.synthetic.scene import rendered_sequence
 from jaxtri.trajectory import Trajectory
 
 
 def write_laboratory(folder: Path, n_frames: int = 100, seed: int = 0, *, progress: bool = True) -> Camera:
-    """Render the laboratory scene into `folder`: frames, timestamps, ground truth (TUM) and camera.json."""
-    scene, camera, times, T_world_camera = laboratory(n_frames, seed)
+    """Render the laboratory scene into `folder`; see `write_footage`."""
+    return write_footage(folder, laboratory(n_frames, seed), seed, progress=progress)
+
+
+def write_footage(folder: Path, footage: Footage, seed: int = 0, *, progress: bool = True) -> Camera:
+    """Render a sequence into `folder`: frames, timestamps, ground truth (TUM) and camera.json."""
+    scene, camera, times, T_world_camera = footage
+    n_frames = len(times)
     names = [f"frames/{k:06d}.jpg" for k in range(n_frames)]
     images = rendered_sequence(scene, camera, T_world_camera, noise_gray=1.0, seed=seed)
     bar = tqdm(images, total=n_frames, unit="frame", desc="rendering", disable=None if progress else True, leave=False)

@@ -13,7 +13,7 @@ from jaxtri.pipeline import Run
 def write_recording(run: Run, camera: Camera, path: Path) -> Path:
     """Write a recording that `rerun FILE` shows; raises `JaxtriError` where rerun is not installed."""
     try:
-        import rerun as rr
+        import rerun as rr  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise JaxtriError("the recording needs rerun: python -m pip install 'jaxtri[viewer]'") from None
     with atomic_path(path) as temporary:
