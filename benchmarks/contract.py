@@ -5,16 +5,13 @@ One file, one question, one command: `--seed`, `--trials` where trials are drawn
 """
 
 import argparse
-import importlib.metadata
 import math
-import platform
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxtri.io import write_json
-
-PACKAGES = ("jaxtri", "jax", "jaxlib", "equinox", "optimistix", "jaxlie", "numpy", "opencv-python-headless")
+from jaxtri.results import versions
 
 
 def parser(question: str, *, trials: int | None = None, data: bool = False) -> argparse.ArgumentParser:
@@ -29,11 +26,6 @@ def parser(question: str, *, trials: int | None = None, data: bool = False) -> a
     p.add_argument("--plots", type=Path, metavar="DIR", help="write figures here")
     p.add_argument("--json", type=Path, metavar="FILE", help="write the figures here")
     return p
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and the packages that matter."""
-    return {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in PACKAGES}
 
 
 def report(path: Path | None, figures: dict[str, float]) -> None:

@@ -17,15 +17,17 @@ import warnings
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from contract import parser, report, table
 
 jax.config.update("jax_enable_x64", True)
 
 from jaxtri.bases import Base  # noqa: E402
-from jaxtri.io import read_camera, read_tum  # noqa: E402
+from jaxtri.io import atomic_path, read_camera, read_tum  # noqa: E402
 from jaxtri.pipeline import Run, follow_tracks, track  # noqa: E402
-from jaxtri.trajectory import Evaluation, evaluate  # noqa: E402
+from jaxtri.plot import plot_trajectory  # noqa: E402
+from jaxtri.trajectory import Evaluation, Trajectory, align, evaluate  # noqa: E402
 from jaxtri.vision.video import open_source  # noqa: E402
 
 # ATE in % of the path: essential, pnp, window, isam2, svo (causal), full BA, COLMAP (batch).
@@ -51,6 +53,16 @@ def run_sequence(folder: Path, base: Base) -> tuple[Run, Evaluation, float]:
     one_scale = len(posed) if run.odometry.scale_unknown_from is None else run.odometry.scale_unknown_from
     coverage = posed[:one_scale].sum() / len(posed)
     return run, evaluate(run.trajectory, read_tum(folder / "groundtruth.txt")), float(coverage)
+
+
+def plot(run: Run, folder: Path, path: Path) -> None:
+    """The trajectory aligned to the truth, and the truth."""
+    truth, T = read_tum(folder / "groundtruth.txt"), run.trajectory.T_world_camera
+    fit = align(jnp.asarray(T[:, :3, 3]), jnp.asarray(truth.positions))
+    aligned = Trajectory(run.trajectory.times, np.asarray(fit.transform_poses(jnp.asarray(T))))
+    figure = plot_trajectory(aligned, reference=truth, units="m", title=path.stem)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=100)
 
 
 def dinosaur(folder: Path) -> dict[str, float]:
@@ -99,6 +111,8 @@ def main() -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 run, errors, coverage = run_sequence(folder, Base(kind))
+            if args.plots:
+                plot(run, folder, args.plots / f"{kind}_{name}.png")
             fps = float(run.statistics["frames_per_second"])  # pyright: ignore[reportArgumentType]
             figures |= {
                 f"{prefix}{name}.coverage": coverage,

@@ -51,18 +51,24 @@ class Model(Protocol[Mean]):
         ...
 
 
+def _number(x: Array | float) -> Array:
+    # Of a definite dtype: a weakly typed leaf would compile once more than a plain one.
+    return x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.result_type(float))
+
+
 class Robust(eqx.Module):
     """Graduated Geman-McClure weights w = (1 + m2/c)^-2, then a hard gate.
 
     The scale c falls geometrically from `start` to `scale` over the passes, so that the first pass sees a
     convex problem; m2 is the squared Mahalanobis distance under the measurement noise, not under the
     prediction: gating against the prediction throws good points away whenever the motion changes. `gate`
-    is the m2 above which an item is left out in the end; 13.8 is the 99.9 % quantile of 2 components.
+    is the m2 above which an item is left out in the end; 13.8 is the 99.9 % quantile of 2 components. A
+    higher `start` survives a worse prediction and needs more passes: 1e4 nine, 1e7 about sixteen.
     """
 
-    start: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(1e7), converter=jnp.asarray)
-    scale: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(16.0), converter=jnp.asarray)
-    gate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(13.8), converter=jnp.asarray)
+    start: Float[Array, ""] = eqx.field(default=1e4, converter=_number)
+    scale: Float[Array, ""] = eqx.field(default=16.0, converter=_number)
+    gate: Float[Array, ""] = eqx.field(default=13.8, converter=_number)
 
 
 class Diagnostics(eqx.Module):
@@ -127,7 +133,7 @@ def _stand_in(mask: Bool[Array, " n"], items: PyTree) -> PyTree:
     return jax.tree.map(replace, items)
 
 
-def _linearise(model: Model, prior: Mean, delta: Array, items: PyTree, observed: Array, mask: Array) -> _Linearisation:
+def _linearise(model: Model, prior: Any, delta: Array, items: PyTree, observed: Array, mask: Array) -> _Linearisation:
     """Residual, Jacobian with respect to the error of the *prior*, and noise, at `retract(prior, delta)`."""
 
     def predicted(error: Array) -> Array:

@@ -303,4 +303,9 @@ def filter(
     """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan."""
     if dt is None:
         dt = jnp.ones(observed.shape[0], observed.dtype)
-    return jax.lax.scan(lambda carry, frame: step(settings, carry, *frame), state, (observed, visible, fresh, dt))
+
+    @jax.checkpoint  # a reverse gradient keeps one state a frame, not every intermediate of every pass
+    def body(carry: State, frame: tuple) -> tuple[State, Report]:
+        return step(settings, carry, *frame)
+
+    return jax.lax.scan(body, state, (observed, visible, fresh, dt))

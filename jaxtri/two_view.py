@@ -103,5 +103,9 @@ def refine(
     d = distances(x)
     inlier = jnp.abs(d) < 3
     rms = jnp.sqrt(jnp.sum(jnp.where(inlier, d**2, 0)) / jnp.maximum(jnp.sum(valid * inlier), 1))
-    ok = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(x))
-    return TwoView(T, R, lift @ ((inside + inside.T) / 2) @ lift.T, rms, ok)
+    covariance = lift @ ((inside + inside.T) / 2) @ lift.T
+    known = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(inside) > 0)
+    # Five unknowns want five pairs, unless a prior holds what the pairs leave open.
+    enough = (jnp.sum(mask) >= 5) | (prior is not None)
+    ok = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(x)) & known & enough
+    return TwoView(T, R, covariance, rms, ok)
