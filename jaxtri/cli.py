@@ -113,6 +113,7 @@ def _track(options: Track) -> None:
     from jaxtri.results import write_overlay, write_results
     from jaxtri.vision.video import open_source
 
+    _check(options)
     base = _base(options.base)
     live = options.source.isdecimal() and not Path(options.source).exists()
     if live and options.max_frames is None:
@@ -145,6 +146,15 @@ def _track(options: Track) -> None:
                     raise
                 print(f"jaxtri: warning: no overlay: {error}", file=sys.stderr)
     _summarise(run, paths)
+
+
+def _check(options: Track) -> None:
+    """Numbers that no run can use, named before anything is opened."""
+    least = {"features": 50, "overlap": 1, "max_frames": 1, "min_parallax": 0, "noise_px": 1e-6}
+    for name, low in least.items():
+        value = getattr(options, name)
+        if value is not None and not low <= value < float("inf"):
+            raise InputError(f"--{name.replace('_', '-')} {value:g}: give a number of at least {low:g}")
 
 
 def _base(name: str) -> Any:

@@ -87,6 +87,8 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
     assert "fov" in track(sequence, "--fov", "190").lower()
     assert "choose one of" in track(sequence, "--camera", camera, "--base", "none")
     assert "at least two" in track(sequence, "--camera", camera, "--max-frames", "1")
+    for option, value in (("--features", "-5"), ("--noise-px", "nan"), ("--overlap", "0"), ("--max-frames", "0")):
+        assert option in track(sequence, "--camera", camera, option, value)
     for name, value in (("fx", None), ("fx", -560.0), ("cy", float("inf")), ("model", "pushbroom")):
         entries = json.loads(camera.read_text())
         if value is None:

@@ -150,7 +150,7 @@ def rendered_sequence(
     rays = pixel_rays(camera)
 
     def frame(k: int, T: np.ndarray) -> np.ndarray:
-        image = render(scene, camera, np.linalg.solve(T, np.eye(4)), rays=rays).image
+        image = render(scene, camera, np.linalg.solve(T, np.eye(4)), supersample=3, rays=rays).image
         if noise_gray == 0:
             return image
         noise = np.random.default_rng((seed, k)).standard_normal(image.shape, np.float32)
