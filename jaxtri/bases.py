@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxtri import segments, tracker
 from jaxtri.ekf import Diagnostics
 from jaxtri.geometry.epipolar import inverse_depth
-from jaxtri.geometry.pose import compose, shear
+from jaxtri.geometry.pose import compose, multiply, relative, shear
 from jaxtri.models.base_pairs import BasePoint, base_point
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.two_view import TwoView, refine
@@ -311,8 +311,8 @@ class SinglePair:
         found = find(self.settings, self.start, [first, second]).pose
         if found is None:
             return None  # go on with the old pair as long as it lasts
-        relative = pose1 @ self.state.placement.pose.inverse()
-        before, before_sd = _depths(self.state, relative)
+        view = relative(self.state.placement.pose, pose1)
+        before, before_sd = _depths(self.state, view)
         both = np.asarray(self.state.inside) & first.common(second) & (first.ids == self._ids)
         one = _pair_depths(found, jnp.asarray(first.u), jnp.asarray(second.u))
         scale, variance = _common_scale(before, before_sd, *one, jnp.asarray(both), self.settings.sigma)
@@ -338,8 +338,8 @@ class SinglePair:
             common = frame.common(now)
             if common.sum() < self.start.points:
                 continue
-            relative = np.asarray((pose @ other.inverse()).as_matrix())
-            angle = _parallax(frame.u[common], now.u[common], relative[:3, :3])
+            motion = np.asarray(relative(other, pose).as_matrix())
+            angle = _parallax(frame.u[common], now.u[common], motion[:3, :3])
             # Information on depth: the angle, up to where more of it no longer helps, by the root of the count.
             score = min(angle, 3 * float(self.settings.fixed_parallax)) * np.sqrt(common.sum())
             if score > best:
@@ -349,12 +349,12 @@ class SinglePair:
         frame, other = choice
         index = [h[0].index for h in self._history].index(frame.index)
         earlier_covariance = self._history[index][2]
-        relative = pose @ other.inverse()
+        motion = relative(other, pose)
         own = segments.own_covariance(self.state)
-        T = relative.translation()
+        T = motion.translation()
         refined = _refine(
             T,
-            relative.rotation(),
+            motion.rotation(),
             jnp.asarray(frame.u),
             jnp.asarray(now.u),
             jnp.asarray(frame.common(now)),
@@ -377,7 +377,7 @@ class SinglePair:
             return None
         self._new = False
         mean, one = self.state.belief.mean, self.state.placement.pose
-        two = compose(mean.base_rotation, mean.base_translation) @ one
+        two = multiply(compose(mean.base_rotation, mean.base_translation), one)
         base = _pairs(self.state.pairs, one, two)
         return _points(base, np.asarray(self.state.inside), self._ids, self.settings)
 

@@ -2,7 +2,6 @@
 
 import sys
 import warnings
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -111,7 +110,7 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 def _track(options: Track) -> None:
     from jaxtri.pipeline import warm_up
     from jaxtri.results import write_overlay, write_results
-    from jaxtri.vision.video import open_source
+    from jaxtri.vision.video import open_source, spool
 
     _check(options)
     base = _base(options.base)
@@ -122,7 +121,7 @@ def _track(options: Track) -> None:
         camera = _camera(options, source.size)
         if live:
             warm_up(camera, **_options(camera, base, options))
-        frames: Any = _spooled(source, options.out / "frames") if live else source
+        frames: Any = spool(source, options.out / "frames") if live else source
         run = _run(frames, camera, base, options)
         fps = source.fps
     paths = write_results(
@@ -197,20 +196,6 @@ def _options(camera: Any, base: Any, options: Track) -> dict[str, Any]:
         "start": StartSettings.of(base, overlap=options.overlap, **changes),
         "klt": KLTSettings(capacity=options.features),
     }
-
-
-def _spooled(frames: Any, folder: Path) -> Iterator[Any]:
-    """The frames of a camera, kept as files on their way: the overlay needs them again."""
-    import cv2
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "timestamps.txt", "w") as stamps:
-        for frame in frames:
-            name = f"{frame.index:06d}.jpg"
-            cv2.imwrite(str(folder / name), frame.image, [cv2.IMWRITE_JPEG_QUALITY, 95])
-            stamps.write(f"{frame.time_s:.6f} {name}\n")
-            stamps.flush()
-            yield frame
 
 
 def _summarise(run: Any, paths: list[Path]) -> None:

@@ -31,15 +31,10 @@ class Run:
 
     def scaled(self, scale: float) -> "Run":
         """The same run in other units of length: trajectory, points and poses multiplied by `scale`."""
-        T = self.trajectory.T_world_camera.copy()
-        T[:, :3, 3] *= scale
-        s = np.repeat([scale, 1.0], 3)
-        C = self.trajectory.covariance
-        trajectory = replace(self.trajectory, T_world_camera=T, covariance=None if C is None else C * np.outer(s, s))
-        points = Points(self.points.ids, self.points.xyz * scale, self.points.covariance * scale**2)
         odometry = copy(self.odometry)
         odometry.poses = [p.scaled(scale) for p in self.odometry.poses]
-        return replace(self, trajectory=trajectory, points=points, odometry=odometry)
+        points = Points(self.points.ids, self.points.xyz * scale, self.points.covariance * scale**2)
+        return replace(self, trajectory=odometry.trajectory(), points=points, odometry=odometry)
 
 
 def track(

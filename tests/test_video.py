@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from jaxtri.errors import ResolutionChangeError, TruncatedVideoError, TruncatedVideoWarning, VideoError
-from jaxtri.vision.video import open_source, write_video
+from jaxtri.vision.video import Frame, open_source, spool, write_video
 
 
 def images(count, size=(64, 48)):
@@ -152,3 +152,13 @@ def test_a_closed_source_has_ended(folder):
     source.close()
     assert list(source) == []
     assert source.decoded == 1
+
+
+def test_spooled_frames_come_back_with_their_times(tmp_path):
+    image = np.full((48, 64, 3), 90, np.uint8)
+    frames = [Frame(k, 0.1 * k + 0.05, image) for k in range(3)]
+    assert [f.index for f in spool(frames, tmp_path / "frames")] == [0, 1, 2]
+    with open_source(tmp_path / "frames") as source:
+        again = list(source)
+    np.testing.assert_allclose([f.time_s for f in again], [0.05, 0.15, 0.25])
+    assert again[0].image.shape == (48, 64, 3)

@@ -154,6 +154,18 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
     return FrameSource(text, Capture(text, text), fps, strict)
 
 
+def spool(frames: Iterable[Frame], folder: Path) -> Iterator[Frame]:
+    """Pass the frames of a camera on, kept as JPEG files with their times, for whoever needs them again."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "timestamps.txt", "w") as stamps:
+        for frame in frames:
+            name = f"{frame.index:06d}.jpg"
+            cv2.imwrite(str(folder / name), frame.image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+            stamps.write(f"{frame.time_s:.6f} {name}\n")
+            stamps.flush()
+            yield frame
+
+
 def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> int:
     """Write BGR uint8 images (h, w, 3) as a video file, which appears when complete; returns their number.
 
