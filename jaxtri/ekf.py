@@ -24,7 +24,11 @@ class Belief(eqx.Module, Generic[Mean]):
 
 @runtime_checkable
 class Model(Protocol[Mean]):
-    """What a filter asks of its problem; every method is a pure function of one item."""
+    """What a filter asks of its problem; every method is a pure function of one item.
+
+    A model may also have an attribute `considered`, a boolean array (d,): error components that are counted
+    with their covariance and never corrected (consider parameters, Schmidt 1966).
+    """
 
     def retract(self, mean: Mean, delta: Float[Array, " d"]) -> Mean:
         """The state moved by an error."""
@@ -160,24 +164,40 @@ def _normal_equations(lin: _Linearisation, weights: Array, delta: Array) -> tupl
     return H.T @ H, H.T @ (r + H @ delta)
 
 
-def _solve(P: Array, A: Array, b: Array) -> tuple[Array, Array]:
-    """Posterior error and covariance (P^-1 + A)^-1 [b, I], for a P that may be singular.
+def _system(P: Array, A: Array) -> tuple[Array, Array, Array]:
+    """I + P A and P in coordinates scaled by the prior's standard deviations, and these.
 
-    In coordinates scaled by the prior's standard deviations, without which float32 does not survive; A alone
-    is never inverted (a scale it does not see leaves it rank deficient), nor is P (a pinned direction has no
-    uncertainty).
+    Without scaling float32 does not survive; A alone is never inverted (a scale it does not see leaves it
+    rank deficient), nor is P (a pinned direction has no uncertainty).
     """
     variance = jnp.diagonal(P)
     s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
-    Ps, As = P / jnp.outer(s, s), A * jnp.outer(s, s)
-    identity = jnp.eye(b.size, dtype=b.dtype)
-    solved = jnp.linalg.solve(identity + Ps @ As, jnp.concatenate([Ps, (Ps @ (b * s))[:, None]], axis=1))
-    posterior = (solved[:, :-1] + solved[:, :-1].T) / 2
-    return solved[:, -1] * s, posterior * jnp.outer(s, s)
+    Ps = P / jnp.outer(s, s)
+    return jnp.eye(s.size, dtype=P.dtype) + Ps @ (A * jnp.outer(s, s)), Ps, s
+
+
+def _error(P: Array, A: Array, b: Array) -> Array:
+    """Posterior error (P^-1 + A)^-1 b, for a P that may be singular."""
+    M, Ps, s = _system(P, A)
+    return jnp.linalg.solve(M, Ps @ (b * s)) * s
+
+
+def _posterior(P: Array, A: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Posterior error, its covariance (P^-1 + A)^-1, and log det (I + P A)."""
+    M, Ps, s = _system(P, A)
+    solved = jnp.linalg.solve(M, jnp.concatenate([Ps, (Ps @ (b * s))[:, None]], axis=1))
+    covariance = (solved[:, :-1] + solved[:, :-1].T) / 2
+    return solved[:, -1] * s, covariance * jnp.outer(s, s), jnp.linalg.slogdet(M)[1]
 
 
 def _distance(lin: _Linearisation) -> Array:
     return jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, lin.residual) ** 2, axis=-1)
+
+
+def _moved(lin: _Linearisation, step: Array) -> _Linearisation:
+    """The residuals that the linearisation leaves after a step of the error."""
+    residual = lin.residual - jnp.einsum("nmd,d->nm", lin.jacobian, step)
+    return _Linearisation(residual, lin.jacobian, lin.whitener, lin.log_det)
 
 
 def transition(model: Model[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
@@ -250,10 +270,15 @@ def update(
         c = jnp.exp(jnp.log(start) + jnp.minimum(share, 1) * (jnp.log(scale) - jnp.log(start)))
         return valid * (1 + _distance(lin) / c) ** -2
 
+    considered = getattr(model, "considered", None)
+
+    def correct(error: Array) -> Array:
+        return error if considered is None else jnp.where(considered, 0.0, error)
+
     def iterate(k: Array, delta: Array) -> Array:
         lin = _linearise(model, prior, delta, items, observed, mask)
         A, b = _normal_equations(lin, weigh(lin, k), delta)
-        return _solve(P, A, b)[0]
+        return correct(_error(P, A, b))
 
     # A loop, not an unrolled chain: unrolling multiplies the compile time by the number of passes.
     delta = jax.lax.fori_loop(0, passes - 1, iterate, jnp.zeros(P.shape[0], dtype))
@@ -264,7 +289,11 @@ def update(
         used = mask & (_distance(lin) < robust.gate.astype(dtype))
         weights = jnp.where(used, weights, 0.0)
     A, b = _normal_equations(lin, weights, delta)
-    final, covariance = _solve(P, A, b)
+    optimal, covariance, log_det = _posterior(P, A, b)
+    final = correct(optimal)
+    if considered is not None:
+        # The gain of all other components is the optimal one, and so is what they have in common with these.
+        covariance = jnp.where(jnp.logical_and.outer(considered, considered), P, covariance)
 
     mean = model.retract(prior, final)
     # The error now lives at the new mean: carry the covariance there by the derivative of the change of origin.
@@ -272,21 +301,17 @@ def update(
     posterior = Belief(mean, reset @ covariance @ reset.T)
 
     # nu' S^-1 nu and log det S without S: by the solution's own normal equations, free of cancellation.
-    after = lin.residual - jnp.einsum("nmd,d->nm", lin.jacobian, final - delta)
-    quadratic = jnp.sum(weights[:, None] * jnp.einsum("nij,nj->ni", lin.whitener, after) ** 2)
-    nis = quadratic + final @ (b - A @ final)
-    scale = jnp.sqrt(jnp.where(jnp.diagonal(P) > 0, jnp.diagonal(P), 1.0))
-    scaled = jnp.eye(P.shape[0], dtype=dtype) + (P / jnp.outer(scale, scale)) @ (A * jnp.outer(scale, scale))
-    log_det = jnp.linalg.slogdet(scaled)[1] + jnp.sum(jnp.where(used, lin.log_det, 0.0))
+    quadratic = jnp.sum(weights * _distance(_moved(lin, optimal - delta)))
+    nis = quadratic + optimal @ (b - A @ optimal)
+    log_det = log_det + jnp.sum(jnp.where(used, lin.log_det, 0.0))
     m = observed.shape[-1]
     constant = m * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
-    distance = jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, after) ** 2, axis=-1)
     diagnostics = Diagnostics(
         log_likelihood=-(nis + log_det + constant) / 2,
         nis=nis,
         used=jnp.sum(used),
         weights=weights,
-        distance=distance,
+        distance=_distance(_moved(lin, final - delta)),
     )
     return posterior, diagnostics
 

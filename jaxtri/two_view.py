@@ -24,7 +24,7 @@ class TwoView(eqx.Module):
     converged: Bool[Array, ""]
 
 
-def _tangent(n: Float[Array, "3"]) -> Float[Array, "3 2"]:
+def tangent_basis(n: Float[Array, "3"]) -> Float[Array, "3 2"]:
     """Orthonormal basis of the plane perpendicular to the unit vector n (Duff et al. 2017)."""
     sign = jnp.where(n[2] < 0, -1.0, 1.0).astype(n.dtype)
     a = -1 / (sign + n[2])
@@ -60,7 +60,7 @@ def refine(
     dtype = translation.dtype
     sigma = jnp.asarray(sigma, dtype)
     length = safe_norm(translation)
-    basis = _tangent(translation / length)
+    basis = tangent_basis(translation / length)
     valid = mask.astype(dtype)
     u1, u2 = (jnp.where(mask[:, None], u, jnp.zeros((), dtype)) for u in (u1, u2))
     root = None
@@ -96,7 +96,7 @@ def refine(
     s = 1 / jnp.sqrt(jnp.where(jnp.diagonal(A) > 0, jnp.diagonal(A), 1))
     inside = jnp.outer(s, s) * jnp.linalg.solve(A * jnp.outer(s, s), jnp.eye(5, dtype=dtype))
     T, R = pose(x)
-    onto = _tangent(T / length)
+    onto = tangent_basis(T / length)
     J_T = jax.jacfwd(lambda y: pose(y)[0])(x)
     J_R = jax.jacfwd(lambda y: (pose(y)[1] @ R.inverse()).log())(x)
     lift = jnp.concatenate([onto @ (onto.T @ J_T), J_R])

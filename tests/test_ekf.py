@@ -228,6 +228,33 @@ def test_update_equals_the_dense_iterated_filter(passes):
     np.testing.assert_allclose(diagnostics.nis, expected[3], rtol=1e-6)
 
 
+class PartlyConsidered(Linear):
+    considered = np.array([False, True, False, True])
+
+
+def test_considered_components_are_counted_and_not_corrected():
+    """Schmidt's filter in its textbook form: rows of the gain are struck out, Joseph's form does the rest."""
+    rng = np.random.default_rng(0)
+    A, H = rng.standard_normal((4, 4)), rng.standard_normal((6, 2, 4))
+    R = np.tile(np.array([[0.5, 0.1], [0.1, 0.3]]), (6, 1, 1))
+    belief = ekf.Belief(jnp.asarray(rng.standard_normal(4)), jnp.asarray(A @ A.T))
+    observed, items = rng.standard_normal((6, 2)), {"H": jnp.asarray(H), "R": jnp.asarray(R)}
+    arguments = belief, items, jnp.asarray(observed), jnp.ones(6, bool)
+    models = [kind(jnp.eye(4), jnp.eye(4)) for kind in (PartlyConsidered, Linear)]
+    (found, told), (_, plain) = (update(m, *arguments, passes=3) for m in models)
+
+    P, G = np.asarray(belief.covariance), H.reshape(12, 4)
+    D = block_diagonal(R)
+    K = P @ G.T @ np.linalg.inv(G @ P @ G.T + D)
+    K[PartlyConsidered.considered] = 0
+    keep = np.eye(4) - K @ G
+    np.testing.assert_allclose(found.covariance, keep @ P @ keep.T + K @ D @ K.T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.mean, belief.mean + K @ (observed.ravel() - G @ belief.mean), rtol=1e-9)
+    # What the innovations say is the same whoever is corrected.
+    np.testing.assert_allclose(told.log_likelihood, plain.log_likelihood, rtol=1e-9)
+    np.testing.assert_allclose(told.nis, plain.nis, rtol=1e-9)
+
+
 def test_prediction_equals_the_dense_one():
     model, belief = sextant()
     dt = jnp.asarray(1.5)

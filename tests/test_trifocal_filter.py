@@ -32,7 +32,9 @@ def begin(key):
 @partial(jax.jit, static_argnames="paper")
 def track(e, two_view, paper=False):
     belief = start(two_view, euler=paper, **SD)
-    model = Trifocal(e.sigma, *NOISE.astype(e.sigma.dtype), two_view.translation, base_noise=not paper)
+    model = Trifocal(
+        e.sigma, *NOISE.astype(e.sigma.dtype), two_view.translation, base_noise=not paper, refine_base=paper
+    )
     pairs = jnp.concatenate([e.observed[0], e.observed[1]], -1)
     mask = jnp.broadcast_to(informative(belief.mean, pairs, e.sigma, 10.0), e.observed[2:].shape[:2])
     return ekf.filter(model, belief, pairs, e.observed[2:], mask, passes=1 if paper else 4)
@@ -115,7 +117,7 @@ def test_likelihood_gradient_equals_central_differences(first, paper):
 
     @jax.jit
     def likelihood(theta):
-        model = Trifocal(*jnp.exp(theta), jnp.zeros(()), two_view.translation, base_noise=not paper)
+        model = Trifocal(*jnp.exp(theta), jnp.zeros(()), two_view.translation, base_noise=not paper, refine_base=paper)
         return ekf.step(model, belief, pairs, e.observed[2, ::10], jnp.ones(30, bool), passes=1)[1].log_likelihood
 
     theta = jnp.log(jnp.array([e.sigma, *NOISE[:2]]))

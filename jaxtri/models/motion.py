@@ -1,11 +1,28 @@
 """Motion models: a pose, its velocity, and the noise of what the velocity leaves out."""
 
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Float
 
-from jaxtri.geometry.pose import exp_pose, matrix_from_euler, multiply
+from jaxtri.ekf import Belief
+from jaxtri.geometry.pose import (
+    compose,
+    euler_from_matrix,
+    exp_pose,
+    matrix_from_euler,
+    multiply,
+    rotation_matrix,
+    shear,
+)
+from jaxtri.two_view import TwoView
+
+# Of the errors of `Kinematics`, those of the pose: translation and rotation.
+POSE_ROWS = np.array([0, 1, 2, 6, 7, 8])
 
 
 class Kinematics(eqx.Module):
@@ -32,7 +49,26 @@ class Kinematics(eqx.Module):
     @property
     def R(self) -> Float[Array, "3 3"]:
         """Rotation matrix, world to camera."""
-        return self.rotation.as_matrix() if isinstance(self.rotation, SO3) else matrix_from_euler(self.rotation)
+        return rotation_matrix(self.rotation)
+
+    @property
+    def pose(self) -> SE3:
+        """The pose, world to camera."""
+        rotation = self.rotation if isinstance(self.rotation, SO3) else SO3.from_matrix(self.R)
+        return compose(rotation, self.translation)
+
+    def pose_covariance(self, covariance: Float[Array, "d d"]) -> Float[Array, "6 6"]:
+        """Covariance of the pose, as that of its left perturbation (linear, angular).
+
+        `covariance` is that of a state whose first 12 errors are those of this one.
+        """
+        J = shear(self.translation)
+        if not isinstance(self.rotation, SO3):
+            # A rate of the angles as one of the rotation, in camera axes: [w]x = dR R'.
+            dR = jax.jacfwd(matrix_from_euler)(self.rotation)
+            W = jnp.einsum("ijk,lj->ilk", dR, self.R)
+            J = J @ jax.scipy.linalg.block_diag(jnp.eye(3, dtype=J.dtype), jnp.stack([W[2, 1], W[0, 2], W[1, 0]]))
+        return J @ covariance[POSE_ROWS][:, POSE_ROWS] @ J.T
 
 
 class Twist(eqx.Module):
@@ -48,6 +84,60 @@ class Twist(eqx.Module):
     def advance(self, dt: Float[Array, ""]) -> "Twist":
         """The state at constant twist `dt` later."""
         return Twist(multiply(exp_pose(self.twist * dt), self.pose).normalize(), self.twist)
+
+
+class MotionStart(NamedTuple):
+    """Pose and velocity from a two-view estimate, with errors `lever @ e + n`: e of the estimate, n on its own."""
+
+    motion: Kinematics
+    covariance: Float[Array, "6 6"]  # of e, the pose's errors in the order of `motion` (translation, rotation)
+    lever: Float[Array, "12 6"]
+    variance: Float[Array, "12"]  # of n: that of the velocity
+
+
+def from_two_view(
+    two_view: TwoView,
+    *,
+    frames: Float[Array, ""] | float,
+    velocity_sd: Float[Array, ""] | float,
+    angular_velocity_sd: Float[Array, ""] | float,
+    euler: bool = False,
+) -> MotionStart:
+    """The motion at the second of two views, `frames` after the first.
+
+    The velocity is that between the two, with the given standard deviations (scene units and radians per
+    frame) beside what it owes to the pose. With `euler` rotations are the paper's yaw, pitch and roll.
+    """
+    T, R, C = two_view.translation, two_view.rotation, two_view.covariance
+    dtype = T.dtype
+    rotation, rate = R, R.log() / frames
+    if euler:
+        rotation = euler_from_matrix(R.as_matrix())
+        rate = rotation / frames
+        # From the error in camera axes to one of the angles.
+        J = jax.jacfwd(lambda d: euler_from_matrix((SO3.exp(d) @ R).as_matrix()))(jnp.zeros(3, dtype))
+        J = jax.scipy.linalg.block_diag(jnp.eye(3, dtype=dtype), J)
+        C = J @ C @ J.T
+    lever = jnp.zeros((12, 6), dtype).at[POSE_ROWS, jnp.arange(6)].set(1)
+    lever = lever.at[jnp.array([3, 4, 5, 9, 10, 11]), jnp.arange(6)].set(1 / frames)
+    return MotionStart(
+        Kinematics(T, T / frames, rotation, rate), C, lever, _velocity(dtype, velocity_sd, angular_velocity_sd)
+    )
+
+
+def at_rest(
+    dtype: jnp.dtype, *, velocity_sd: Float[Array, ""] | float, angular_velocity_sd: Float[Array, ""] | float
+) -> Belief[Kinematics]:
+    """The camera in the first frame, the world: its pose is exact, its velocity all but unknown."""
+    zero = jnp.zeros(3, dtype)
+    rotation = jax.tree.map(lambda x: x.astype(dtype), SO3.identity())
+    variance = _velocity(dtype, velocity_sd, angular_velocity_sd)
+    return Belief(Kinematics(zero, zero, rotation, zero), jnp.diag(variance))
+
+
+def _velocity(dtype: jnp.dtype, linear_sd: Array | float, angular_sd: Array | float) -> Float[Array, "12"]:
+    variance = jnp.zeros(12, dtype)
+    return variance.at[3:6].set(jnp.square(linear_sd)).at[9:12].set(jnp.square(angular_sd))
 
 
 def acceleration_noise(

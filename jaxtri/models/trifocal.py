@@ -1,8 +1,9 @@
 """The paper's filter: the pose of a camera, measured by the trifocal transfer from two base frames.
 
 The structure of the scene is not in the state: a frame costs O(N). One code path serves three modes that
-differ in what they hold, not in what they do: `default` (SO(3), base noise in R, several passes), `paper`
-(yaw-pitch-roll, constant R, one pass) and, later, a consistent one.
+differ in what they hold, not in what they do: `default` (SO(3), base noise in R, several passes, the second
+base pose considered), `paper` (yaw-pitch-roll, constant R, one pass, the second base pose refined) and,
+later, a consistent one.
 """
 
 from typing import NamedTuple
@@ -10,14 +11,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
 from jaxtri.ekf import Belief
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import euler_from_matrix, local, retract, rotation_matrix
+from jaxtri.geometry.pose import local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
-from jaxtri.models.motion import Kinematics, acceleration_noise
+from jaxtri.models.motion import Kinematics, acceleration_noise, from_two_view
 from jaxtri.two_view import TwoView
 
 
@@ -26,11 +28,12 @@ class Mode(NamedTuple):
 
     euler: bool  # the paper's yaw, pitch and roll instead of SO(3): `start`
     base_noise: bool  # the noise of the base points in R instead of a constant R: `Trifocal`
+    refine_base: bool  # the second base pose refined in every frame instead of considered: `Trifocal`
     passes: int  # linearisations of an update: `ekf.filter`
 
 
-DEFAULT = Mode(euler=False, base_noise=True, passes=4)
-PAPER = Mode(euler=True, base_noise=False, passes=1)
+DEFAULT = Mode(euler=False, base_noise=True, refine_base=False, passes=4)
+PAPER = Mode(euler=True, base_noise=False, refine_base=True, passes=1)
 
 
 class TrifocalState(eqx.Module):
@@ -49,6 +52,10 @@ class Trifocal(eqx.Module):
 
     Every field is a leaf and may be tuned; lengths are normalised image units (pixels over focal length) and
     units of the scene, per frame.
+
+    Every frame uses the same noise of the base points again. A second base pose that is refined as in the
+    paper takes it for new information each time, and its covariance ends ten times too small; considered, it
+    is counted with the covariance of the start and left alone.
     """
 
     sigma: Float[Array, ""]  # noise of an image point, in all three views
@@ -57,6 +64,12 @@ class Trifocal(eqx.Module):
     base_drift: Float[Array, ""]  # of the second base pose, per frame
     epipole: Float[Array, "3"]  # of the second base frame, homogeneous, as known at the start
     base_noise: bool = eqx.field(static=True, default=True)
+    refine_base: bool = eqx.field(static=True, default=False)
+
+    @property
+    def considered(self) -> Bool[np.ndarray, "18"] | None:
+        """The second base pose, unless it is refined."""
+        return None if self.refine_base else np.arange(18) >= 12
 
     def retract(self, mean: TrifocalState, delta: Float[Array, "18"]) -> TrifocalState:
         """The state moved by an error; the length of the base line is the gauge and stays."""
@@ -116,22 +129,12 @@ def start(
     correlated. The velocity is that between the two frames, with the given standard deviations (scene
     units and radians per frame). With `euler` rotations are the paper's yaw, pitch and roll.
     """
-    T, R, C = two_view.translation, two_view.rotation, two_view.covariance
-    dtype = T.dtype
-    angles = euler_from_matrix(R.as_matrix())
-    rotation, rate = (angles, angles / frames) if euler else (R, R.log() / frames)
-    state = TrifocalState(Kinematics(T, T / frames, rotation, rate), T, rotation)
-    if euler:
-        # From the error in camera axes to one of the angles.
-        J = jax.jacfwd(lambda d: euler_from_matrix((SO3.exp(d) @ R).as_matrix()))(jnp.zeros(3, dtype))
-        C = jax.scipy.linalg.block_diag(jnp.eye(3, dtype=dtype), J) @ C
-        C = C @ jax.scipy.linalg.block_diag(jnp.eye(3, dtype=dtype), J).T
-    # Rows of the 18 errors that are the translation and rotation of the pose, in both places.
-    E = jnp.zeros((18, 6), dtype).at[jnp.array([0, 1, 2, 6, 7, 8]), jnp.arange(6)].set(1)
-    E = E.at[jnp.arange(12, 18), jnp.arange(6)].set(1)
-    E = E.at[jnp.array([3, 4, 5, 9, 10, 11]), jnp.arange(6)].set(1 / frames)
-    variance = jnp.zeros(18, dtype).at[3:6].set(jnp.square(velocity_sd)).at[9:12].set(jnp.square(angular_velocity_sd))
-    return Belief(state, E @ C @ E.T + jnp.diag(variance))
+    motion, C, lever, variance = from_two_view(
+        two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd, euler=euler
+    )
+    state = TrifocalState(motion, motion.translation, motion.rotation)
+    E = jnp.concatenate([lever, jnp.eye(6, dtype=lever.dtype)])
+    return Belief(state, E @ C @ E.T + jnp.diag(jnp.pad(variance, (0, 6))))
 
 
 def informative(

@@ -1,9 +1,9 @@
 """The paper's synthetic experiment, from a key. Source: Yu et al. 2006, section VIII.A.
 
-What the paper leaves open is stated here and may be changed: the pixel pitch (`focal_px` = 600: 6 mm at
-10 micrometres), the signs of the motion (drawn per axis and segment; along z the object recedes, so that no
-point passes the camera), its centre of rotation (the centre of the object), and the scale gauge (the true
-length of the first base line).
+What the paper leaves open is stated here: the pixel pitch (10 micrometres: 600 px of focal length), the
+signs of the motion (drawn per axis and segment; along z the object recedes, so that no point passes the
+camera), its centre of rotation (the centre of the object), and the scale gauge (metres; the length of the
+first base line may be given instead). All but the centre may be changed.
 """
 
 from typing import NamedTuple
@@ -35,16 +35,25 @@ def paper_experiment(
     degrees_per_frame: tuple[float, float] = (0.2, 1.2),
     metres_per_frame: tuple[float, float] = (0.005, 0.015),
     noise_px: float = 0.1,
-    focal_px: float = 600.0,
+    focal_mm: float = 6.0,
+    pixel_mm: float = 0.01,
+    signs: Float[Array, "3 6"] | None = None,
+    base_line: float | None = None,
 ) -> Experiment:
-    """One trial: pure translation, pure rotation, then both, each a third of the frames; vmap over keys."""
+    """One trial: pure translation, pure rotation, then both, each a third of the frames; vmap over keys.
+
+    `signs` (+-1) are those of the motion, a row per segment, columns (tx, ty, tz, rx, ry, rz); drawn by
+    default, tz positive. With `base_line` the scene and its motion are scaled so that the camera's first step
+    has this length.
+    """
     k_points, k_turn, k_shift, k_sign, k_noise = jax.random.split(key, 5)
     side = volume_m3 ** (1 / 3)
     centre = jnp.array([0.0, 0.0, distance_m])
     points = centre + jax.random.uniform(k_points, (n_points, 3), minval=-side / 2, maxval=side / 2)
 
     segment = jnp.minimum(jnp.arange(n_frames - 1) * 3 // (n_frames - 1), 2)
-    signs = jnp.where(jax.random.bernoulli(k_sign, shape=(3, 6)), 1.0, -1.0).at[:, 2].set(1.0)
+    if signs is None:
+        signs = jnp.where(jax.random.bernoulli(k_sign, shape=(3, 6)), 1.0, -1.0).at[:, 2].set(1.0)
     low, high = metres_per_frame
     shift = jax.random.uniform(k_shift, (n_frames - 1, 3), minval=low, maxval=high) * signs[segment, :3]
     low, high = (jnp.deg2rad(d) for d in degrees_per_frame)
@@ -64,7 +73,9 @@ def paper_experiment(
     translations = jnp.concatenate([jnp.zeros((1, 3)), translations])
     camera = jnp.einsum("tij,nj->tni", rotations, points) + translations[:, None]
     clean = camera[..., :2] / camera[..., 2:]
-    sigma = jnp.asarray(noise_px / focal_px)
-    return Experiment(
-        points, rotations, translations, clean, clean + sigma * jax.random.normal(k_noise, clean.shape), sigma
-    )
+    sigma = jnp.asarray(noise_px * pixel_mm / focal_mm)
+    observed = clean + sigma * jax.random.normal(k_noise, clean.shape)
+    if base_line is not None:
+        scale = base_line / jnp.linalg.norm(translations[1])
+        points, translations = scale * points, scale * translations
+    return Experiment(points, rotations, translations, clean, observed, sigma)
