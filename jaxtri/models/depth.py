@@ -1,0 +1,269 @@
+"""The scene: one small filter per point, given the pose. Source: Yu et al. 2006, sections V and VI.
+
+A point is one parameter along the ray of the image point where it was first seen, in the camera of that
+frame. N such filters, in closed form and batched, follow the pose filter: O(N) a frame, and the pose does
+not depend on them.
+
+The ray itself was measured once, with the noise of one image point, and that error never averages out. So
+each filter also carries the covariance of its ray: it may be ignored (`ray_sigma` of zero, the paper),
+considered (Schmidt 1966: one parameter is estimated, its variance is right) or estimated along (`rays`, the
+default; the measurement biases of Azarbayejani & Pentland 1995, section III).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float
+
+from jaxtri.geometry.epipolar import homogeneous, inverse_depth
+from jaxtri.geometry.trifocal import project
+from jaxtri.two_view import TwoView
+
+
+class Bank(NamedTuple):
+    """N points, in slots; a slot whose track has ended keeps its last estimate until another is born in it."""
+
+    parameter: Float[Array, " n"]  # inverse depth, or depth, in the camera of first sight
+    ray: Float[Array, "n 2"]  # normalised image point of first sight
+    covariance: Float[Array, "n 3 3"]  # of the errors (parameter, ray)
+    birth: SE3  # (n,) pose of the camera of first sight, world to camera
+
+
+class WorldPoint(NamedTuple):
+    """A homogeneous world point and its covariance."""
+
+    point: Float[Array, "4"]
+    covariance: Float[Array, "4 4"]
+
+
+class Depth(eqx.Module):
+    """The filter of one point; every field but the last three is a leaf.
+
+    Lengths in units of the scene, image points in normalised units, time in frames.
+    """
+
+    sigma: Float[Array, ""]  # noise of an image point
+    ray_sigma: Float[Array, ""]  # noise of the image point of first sight; 0 takes the ray as exact
+    drift: Float[Array, ""]  # noise of the parameter per frame (eq. 13), relative to its initial value
+    gate: Float[Array, ""]  # squared Mahalanobis distance of an innovation above which it is left out
+    rays: bool = eqx.field(static=True, default=True)  # estimate the ray along with the parameter
+    inverse: bool = eqx.field(static=True, default=True)  # the parameter is the inverse depth
+    passes: int = eqx.field(static=True, default=3)  # linearisations of an update
+
+    @classmethod
+    def of(cls, sigma: Float[Array, ""], *, gate: Float[Array, ""] | float = jnp.inf, rays: bool = True) -> "Depth":
+        """The default: inverse depth, the ray estimated (or, with `rays` False, considered), no drift."""
+        number = jnp.asarray(sigma)
+        return cls(number, number, jnp.zeros_like(number), jnp.asarray(gate, number.dtype), rays)
+
+    @classmethod
+    def paper(
+        cls, sigma: Float[Array, ""], *, drift: Float[Array, ""] | float = 0.01, inverse: bool = False
+    ) -> "Depth":
+        """As published: depth along an exact ray, one pass, process noise because the start is a plane.
+
+        With `inverse` its inverse instead, in which the projection is all but linear: a depth far from the
+        plane is thrown off by its first update and may never come back.
+        """
+        number = jnp.asarray(sigma)
+        drift = jnp.asarray(drift, number.dtype)
+        gate = jnp.full((), jnp.inf, number.dtype)
+        return cls(number, jnp.zeros_like(number), drift, gate, rays=False, inverse=inverse, passes=1)
+
+    def plane(
+        self,
+        observed: Float[Array, "n 2"],
+        pose: SE3,
+        z_init: Float[Array, ""] | float,
+        relative_sd: Float[Array, ""] | float = 1.0,
+    ) -> Bank:
+        """All points on a plane at depth `z_init` before the camera. Source: Yu et al. 2006, eq. 12.
+
+        `relative_sd` is the standard deviation of the parameter over its value.
+        """
+        n, dtype = observed.shape[0], observed.dtype
+        z_init = jnp.asarray(z_init, dtype)
+        start = jnp.full(n, 1.0, dtype) * (1 / z_init if self.inverse else z_init)
+        return self._bank(observed, start, jnp.square(relative_sd * start), pose)
+
+    def _bank(self, ray: Array, parameter: Array, variance: Array, pose: SE3) -> Bank:
+        birth = jax.tree.map(lambda x: jnp.broadcast_to(x.astype(ray.dtype), (len(ray), *x.shape)), pose)
+        ray_variance = jnp.broadcast_to(jnp.square(self.ray_sigma).astype(ray.dtype), (len(ray), 2))
+        diagonal = jnp.concatenate([variance[:, None], ray_variance], axis=1)
+        return Bank(parameter, ray, jax.vmap(jnp.diag)(diagonal), birth)
+
+    def born(
+        self,
+        bank: Bank,
+        fresh: Bool[Array, " n"],
+        observed: Float[Array, "n 2"],
+        pose: SE3,
+        z_init: Float[Array, ""] | float,
+        relative_sd: Float[Array, ""] | float = 1.0,
+    ) -> Bank:
+        """The bank with new points in the `fresh` slots, seen first at `pose`. Source: Yu et al. 2006, eq. 18."""
+        new = self.plane(observed, pose, z_init, relative_sd)
+        return jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *([1] * (a.ndim - 1))), a, b), new, bank)
+
+    def step(
+        self,
+        bank: Bank,
+        pose: SE3,
+        observed: Float[Array, "n 2"],
+        mask: Bool[Array, " n"],
+        pose_covariance: Float[Array, "6 6"] | None = None,
+        dt: Float[Array, ""] | float = 1.0,
+    ) -> Bank:
+        """One frame: predict and update the points that are seen, given the pose. Source: eqs 16-17.
+
+        `pose_covariance` is that of its left perturbation (linear, angular), as if independent from frame to
+        frame; zero by default. What the errors of the poses have in common, a drift or the scale, is in no
+        point's covariance. Masked points stay as they are: a death keeps the last estimate.
+        """
+        if pose_covariance is None:
+            pose_covariance = jnp.zeros((6, 6), observed.dtype)
+        observed = jnp.where(mask[:, None], observed, bank.ray)
+        R, T = pose.rotation().as_matrix(), pose.translation()
+        drift = jnp.square(self.drift) * dt
+
+        def one(parameter: Array, ray: Array, C: Array, birth: SE3, z: Array) -> tuple[Array, Array, Array]:
+            R1, T1 = birth.rotation().as_matrix(), birth.translation()
+            prior = jnp.concatenate([parameter[None], ray])
+            C = C.at[0, 0].add(drift * jnp.square(parameter))
+
+            def predicted(x: Array) -> Array:
+                # The state, then the left perturbation of the pose to first order.
+                X = self._homogeneous(x[:3], R1, T1)
+                moved = R @ X[:3] + X[3] * T
+                moved = moved + X[3] * x[3:6] + jnp.cross(x[6:], moved)
+                return project(jnp.concatenate([moved, X[3:]]), jnp.eye(3, dtype=z.dtype), jnp.zeros(3, z.dtype))
+
+            def linearise(x: Array) -> tuple[Array, Array, Array, Array]:
+                full = jnp.concatenate([x, jnp.zeros(6, x.dtype)])
+                y, push = jax.linearize(predicted, full)
+                J = jax.vmap(push, out_axes=-1)(jnp.eye(9, dtype=x.dtype))
+                H, G = J[:, :3], J[:, 3:]
+                D = jnp.square(self.sigma) * jnp.eye(2, dtype=x.dtype) + G @ pose_covariance @ G.T
+                return z - y - H @ (prior - x), H, D, _inverse_2x2(H @ C @ H.T + D)
+
+            def gain(H: Array, inverse: Array) -> Array:
+                K = C @ H.T @ inverse
+                return K if self.rays else K.at[1:].set(0.0)
+
+            r, H, D, inverse = linearise(prior)
+            inside = r @ inverse @ r <= self.gate
+            x = prior
+            for _ in range(self.passes - 1):
+                x = prior + gain(H, inverse) @ r
+                r, H, D, inverse = linearise(x)
+            K = gain(H, inverse)
+            x = prior + K @ r
+            # Joseph's form: positive whatever the gain, a considered ray's included.
+            keep = jnp.eye(3, dtype=x.dtype) - K @ H
+            updated = keep @ C @ keep.T + K @ D @ K.T
+            good = inside & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(updated))
+            return x, updated, good
+
+        x, C, good = jax.vmap(one)(bank.parameter, bank.ray, bank.covariance, bank.birth, observed)
+        good &= mask
+        drifted = bank.covariance.at[:, 0, 0].add(jnp.where(mask, drift * jnp.square(bank.parameter), 0.0))
+        return Bank(
+            jnp.where(good, x[:, 0], bank.parameter),
+            jnp.where(good[:, None], x[:, 1:], bank.ray),
+            jnp.where(good[:, None, None], C, drifted),
+            bank.birth,
+        )
+
+    def _homogeneous(self, x: Float[Array, "3"], R1: Float[Array, "3 3"], T1: Float[Array, "3"]) -> Float[Array, "4"]:
+        """Homogeneous world point of (parameter, ray) in the camera (R1, T1). Source: Yu et al. 2006, eqs 15, 18."""
+        ray = homogeneous(x[1:])
+        if self.inverse:
+            return jnp.concatenate([R1.T @ (ray - x[0] * T1), x[:1]])
+        return jnp.concatenate([R1.T @ (x[0] * ray - T1), jnp.ones(1, x.dtype)])
+
+    def world(self, bank: Bank, log_scale_variance: Float[Array, ""] | float = 0.0) -> WorldPoint:
+        """The points in the world, homogeneous: shapes (n, 4) and (n, 4, 4).
+
+        `log_scale_variance` is that of the scale of the whole scene about the world's origin, which no later
+        frame can tell: see `scale_variance`.
+        """
+
+        def one(parameter: Array, ray: Array, C: Array, birth: SE3) -> WorldPoint:
+            R1, T1 = birth.rotation().as_matrix(), birth.translation()
+            x = jnp.concatenate([parameter[None], ray])
+            J = jax.jacfwd(lambda y: self._homogeneous(y, R1, T1))(x)
+            X = self._homogeneous(x, R1, T1)
+            return WorldPoint(X, (J @ C @ J.T).at[3, 3].add(log_scale_variance * jnp.square(X[3])))
+
+        return jax.vmap(one)(*bank)
+
+    def triangulated(self, two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"]) -> Bank:
+        """The bank at the first of two views, the world, from their relative pose: the good start.
+
+        A point's variance is that of its triangulation, the uncertain pose included; what the errors of the
+        points have in common is left out.
+        """
+        parameter, by_pose, by_noise = triangulate(two_view, first, second, inverse=self.inverse)
+        spread = jnp.square(self.ray_sigma) * jnp.sum(by_noise[:, :2] ** 2, axis=1)
+        spread += jnp.square(self.sigma) * jnp.sum(by_noise[:, 2:] ** 2, axis=1)
+        pose = jnp.einsum("ni,ij,nj->n", by_pose, two_view.covariance, by_pose)
+        bank = self._bank(first, parameter, spread + pose, SE3.identity())
+        cross = jnp.square(self.ray_sigma) * by_noise[:, :2]
+        return bank._replace(covariance=bank.covariance.at[:, 0, 1:].set(cross).at[:, 1:, 0].set(cross))
+
+
+def triangulate(
+    two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"], *, inverse: bool = True
+) -> tuple[Float[Array, " n"], Float[Array, "n 6"], Float[Array, "n 4"]]:
+    """Inverse depths (or depths) in the first view, and their derivatives.
+
+    With respect to the errors (T, R) of the pose, and to the two observations. A depth is that of an inverse
+    depth of at least a thousandth of the median.
+    """
+    pairs, zero = jnp.concatenate([first, second], axis=-1), jnp.zeros(6, first.dtype)
+
+    def at(error: Array, pair: Array) -> Array:
+        T, R = two_view.translation + error[:3], two_view.rotation.as_matrix()
+        R = R + jnp.cross(error[3:], R.T).T  # exp(error) R, to first order
+        return inverse_depth(pair[:2], pair[2:], R, T, T)
+
+    smallest = 1e-3 * jnp.median(jax.vmap(lambda pair: at(zero, pair))(pairs))
+
+    def parameter(error: Array, pair: Array) -> Array:
+        return at(error, pair) if inverse else 1 / jnp.maximum(at(error, pair), smallest)
+
+    def one(pair: Array) -> tuple[Array, Array, Array]:
+        return parameter(zero, pair), *jax.grad(parameter, argnums=(0, 1))(zero, pair)
+
+    return jax.vmap(one)(pairs)
+
+
+def scale_variance(
+    two_view: TwoView,
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    sigma: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """Variance of the logarithm of the scale of a scene, given the length of the base line of two views.
+
+    All that is ever known of the scale is what these two frames say: later ones refine the shape alone. So it
+    is an error common to all depths, and one that does not average out.
+    """
+    depth, by_pose, by_noise = triangulate(two_view, first, second)
+    weight = jnp.where(mask, 1 / (jnp.square(sigma) * jnp.sum(by_noise**2, axis=1)), 0.0)
+    G = jnp.concatenate([depth[:, None], by_pose], axis=1)
+    A = jnp.einsum("n,ni,nj->ij", weight, G, G)
+    C, App = two_view.covariance, A[1:, 1:]
+    # The errors of the pose eliminated; its covariance is singular along the base line.
+    eliminated = C @ jnp.linalg.solve(jnp.eye(6, dtype=C.dtype) + App @ C, A[1:, 0])
+    return 1 / (A[0, 0] - A[0, 1:] @ eliminated)
+
+
+def _inverse_2x2(S: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    # In closed form: batched LAPACK calls on tiny blocks are slow.
+    det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    return jnp.array([[S[1, 1], -S[0, 1]], [-S[1, 0], S[0, 0]]]) / det
