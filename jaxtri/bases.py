@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from jaxtri import segments, tracker
 from jaxtri.ekf import Diagnostics
 from jaxtri.geometry.epipolar import inverse_depth
-from jaxtri.geometry.pose import compose, multiply, relative, shear
-from jaxtri.models.base_pairs import BasePoint, base_point
+from jaxtri.geometry.pose import compose, relative, shear
+from jaxtri.models.depth import Bank
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.two_view import TwoView, refine
 from jaxtri.vision.initialise import Hypothesis, hypotheses
@@ -157,15 +157,16 @@ def hold(
 
 
 @jax.jit
-def _world_points(base: BasePoint, sigma: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """World points of base pairs, and the covariance of each."""
+def _world_points(bank: Bank, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """World points of a bank, the covariance of each, and which are known: depth to better than a third."""
+    points, covariance = tracker.structure_model(settings).world(bank)
 
-    def one(base: BasePoint) -> tuple[jax.Array, jax.Array]:
-        w = jnp.where(jnp.abs(base.point[3]) > 1e-9, base.point[3], 1e-9)
-        J = (base.spread[:3] - jnp.outer(base.point[:3] / w, base.spread[3])) / w
-        return base.point[:3] / w, jnp.square(sigma) * J @ J.T
+    def one(X: Array, C: Array) -> tuple[Array, Array]:
+        w = jnp.where(jnp.abs(X[3]) > 1e-9, X[3], 1e-9)
+        J = jnp.concatenate([jnp.eye(3, dtype=X.dtype), -(X[:3] / w)[:, None]], axis=1) / w
+        return X[:3] / w, J @ C @ J.T
 
-    return jax.vmap(one)(base)
+    return *jax.vmap(one)(points, covariance), points[:, 3] > 3 * jnp.sqrt(covariance[:, 3, 3])
 
 
 class Points(NamedTuple):
@@ -176,10 +177,28 @@ class Points(NamedTuple):
     covariance: np.ndarray
 
 
-def _points(base: BasePoint, good: np.ndarray, ids: np.ndarray, settings: Settings) -> Points:
-    xyz, covariance = (np.asarray(x) for x in _world_points(base, settings.sigma))
-    good = good & (np.asarray(base.point)[:, 3] > 1e-9) & np.isfinite(xyz).all(axis=1)
-    return Points(ids[good], xyz[good], covariance[good])
+class _Structure:
+    """The points of a bank as tracks come and go: what each was last known to be."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._ended: list[Points] = []
+
+    def of(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> Points:
+        """The known points of the `good` slots."""
+        xyz, covariance, known = (np.asarray(x) for x in _world_points(bank, self._settings))
+        good = good & known & np.isfinite(xyz).all(axis=1)
+        return Points(ids[good], xyz[good], covariance[good])
+
+    def end(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> None:
+        """Keep the points of the `good` slots, whose tracks have ended."""
+        if good.any():
+            self._ended.append(self.of(bank, good, ids))
+
+    def ended(self) -> list[Points]:
+        """What was kept since the last call."""
+        ended, self._ended = self._ended, []
+        return ended
 
 
 class Follower(Protocol):
@@ -197,8 +216,12 @@ class Follower(Protocol):
         """The pose of the next frame."""
         ...
 
-    def points(self) -> Points | None:
-        """The points that the filter now stands on; None where they have not changed."""
+    def ended(self) -> list[Points]:
+        """The points of tracks that have ended since the last call."""
+        ...
+
+    def present(self) -> Points:
+        """The points of the tracks that are followed now."""
         ...
 
 
@@ -209,7 +232,7 @@ class TrackPairs:
         self.settings, self.state = settings, state
         self.keyframes, self.restarts = 2, 0
         self._known = np.where(common, last.ids, -1)
-        self._new = True
+        self._structure = _Structure(settings)
 
     @property
     def depth(self) -> float:
@@ -219,6 +242,8 @@ class TrackPairs:
     def follow(self, frame: Frame, dt: float) -> Report:
         """The pose of the next frame."""
         fresh = frame.fresh | (frame.visible & (frame.ids != self._known))
+        over = (self._known >= 0) & (fresh | ~frame.visible)
+        self._structure.end(self.state.structure, over & self._good(), self._known)
         self._known = np.where(frame.visible, frame.ids, -1)
         self.state, report = _step(
             self.settings,
@@ -229,18 +254,20 @@ class TrackPairs:
             dt,
             hold=jnp.asarray(False),
         )
-        if bool(report.keyframe):
-            self.keyframes += 1
-            self._new = True
+        self.keyframes += int(report.keyframe)
         return report
 
-    def points(self) -> Points | None:
-        """The points of all usable tracks, after a keyframe."""
-        if not self._new:
-            return None
-        self._new = False
-        tracks = self.state.tracks
-        return _points(tracks.base, np.asarray(tracks.usable), self._known, self.settings)
+    def _good(self) -> np.ndarray:
+        # What no base pair agrees on is not a point of the scene.
+        return np.asarray(self.state.tracks.usable) & np.asarray(self.state.born)
+
+    def ended(self) -> list[Points]:
+        """The points of tracks that have ended since the last call."""
+        return self._structure.ended()
+
+    def present(self) -> Points:
+        """The points of the tracks that are followed now."""
+        return self._structure.of(self.state.structure, self._good(), self._known)
 
 
 class SinglePair:
@@ -257,6 +284,7 @@ class SinglePair:
     ) -> None:
         self.settings, self.start, self.base = settings, start, base
         self.keyframes, self.restarts = 2, 0
+        self._structure = _Structure(settings)
         placement = segments.origin(settings.sigma.dtype)._replace(pose=world)
         self._history: deque[tuple[Frame, SE3, Array]] = deque(maxlen=40)
         self._history.append((frames[0], world, jnp.zeros((6, 6), settings.sigma.dtype)))
@@ -280,7 +308,10 @@ class SinglePair:
         )
         self._ids = np.where(mask, second.ids, -1)
         self._size = int(np.asarray(self.state.inside).sum())
-        self._new = True
+
+    def _end(self) -> None:
+        """Keep all points of a segment that another replaces."""
+        self._structure.end(self.state.structure, np.asarray(self.state.inside), self._ids)
 
     def follow(self, frame: Frame, dt: float) -> Report:
         """The pose of the next frame, after a restart where the tracks of the pair have run out."""
@@ -297,6 +328,8 @@ class SinglePair:
 
     def _advance(self, frame: Frame, dt: float) -> Report:
         fresh = frame.fresh | (frame.ids != self._ids)
+        over = np.asarray(self.state.inside) & (fresh | ~frame.visible)
+        self._structure.end(self.state.structure, over, self._ids)
         arrays = jnp.asarray(frame.u), jnp.asarray(frame.visible), jnp.asarray(fresh)
         self.state, report = _segment_step(self.settings, self.state, *arrays, dt)
         self._history.append((frame, report.pose, report.covariance))
@@ -318,6 +351,7 @@ class SinglePair:
         scale, variance = _common_scale(before, before_sd, *one, jnp.asarray(both), self.settings.sigma)
         if both.sum() < 3:
             return None
+        self._end()
         old = self.state.placement.covariance
         placement = segments.Placement(pose1, segments.place(covariance1, old[6, 6] + variance))
         self._begin(first, second, scaled(found, scale), placement)
@@ -363,6 +397,7 @@ class SinglePair:
         )
         if not bool(refined.converged):
             return
+        self._end()
         direction = T / jnp.linalg.norm(T)
         length_variance = direction @ own[:3, :3] @ direction / (T @ T)
         old = self.state.placement.covariance
@@ -371,15 +406,13 @@ class SinglePair:
         self.restarts += 1
         self.keyframes += 1
 
-    def points(self) -> Points | None:
-        """The points of the pair, at the start of a segment."""
-        if not self._new:
-            return None
-        self._new = False
-        mean, one = self.state.belief.mean, self.state.placement.pose
-        two = multiply(compose(mean.base_rotation, mean.base_translation), one)
-        base = _pairs(self.state.pairs, one, two)
-        return _points(base, np.asarray(self.state.inside), self._ids, self.settings)
+    def ended(self) -> list[Points]:
+        """The points of tracks that have ended since the last call."""
+        return self._structure.ended()
+
+    def present(self) -> Points:
+        """The points of the pair's tracks that are followed now."""
+        return self._structure.of(self.state.structure, np.asarray(self.state.inside), self._ids)
 
 
 @jax.jit
@@ -398,11 +431,6 @@ def _segment_report(state: segments.State) -> Report:
         jnp.zeros_like(inside),
         diagnostics,
     )
-
-
-@jax.jit
-def _pairs(pairs: jax.Array, one: SE3, two: SE3) -> BasePoint:
-    return jax.vmap(lambda p: base_point(p[:2], p[2:], one, two))(pairs)
 
 
 @jax.jit

@@ -114,10 +114,9 @@ class Odometry:
             return np.zeros(len(frame.visible), bool)
         report = self._follower.follow(frame, self._dt(index))
         self._record(frame, report.pose, report)
+        self._collect()
         if self.poses[-1].status is Status.LOST:
             self._lose(frame)
-        else:
-            self._collect()
         return np.asarray(report.drop)
 
     @property
@@ -163,11 +162,14 @@ class Odometry:
         return Trajectory(times, world, J @ C @ np.swapaxes(J, 1, 2), status)
 
     def points(self) -> Points:
-        """The points triangulated so far, in the world frame."""
-        if not self._points:
+        """The points of all tracks so far, in the world frame, each as it was last known."""
+        known = self._points.copy()
+        if self._follower is not None:
+            _keep(known, self._follower.present())
+        if not known:
             return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        ids = np.array(sorted(self._points))
-        xyz, covariance = (np.stack([self._points[i][k] for i in ids]) for k in (0, 1))
+        ids = np.array(sorted(known))
+        xyz, covariance = (np.stack([known[i][k] for i in ids]) for k in (0, 1))
         return Points(ids, xyz, covariance)
 
     def _frame(self, index: int, tracks: FrameTracks, time: float) -> Frame:
@@ -194,10 +196,8 @@ class Odometry:
 
     def _collect(self) -> None:
         assert self._follower is not None
-        points = self._follower.points()
-        if points is not None:
-            self._depth = self._follower.depth
-            self._points |= {int(i): (x, c) for i, x, c in zip(*points, strict=True)}
+        for points in self._follower.ended():
+            _keep(self._points, points)
 
     # -- starting ---------------------------------------------------------------------------------------------
 
@@ -252,7 +252,6 @@ class Odometry:
             self._follower = SinglePair(self._settings, self._start, self.base, frames, pose, world)
         self.segments += 1
         self._waiting, self._passed = [], []
-        self._collect()
 
     def _backwards(self, first: Frame, state, world: SE3) -> Iterator[tuple[Frame, Report]]:
         """Frames that waited before the first base frame, newest first, as far as its tracks reach."""
@@ -270,6 +269,15 @@ class Odometry:
         """The camera is lost: start again from here."""
         assert self._follower is not None
         self._changes += self._follower.restarts
+        self._depth = self._follower.depth
+        _keep(self._points, self._follower.present())
         self._follower = None
         self._waiting, self._tried = [frame], (-1, 0.0)
         self.reason = "too few points agreed with any motion"
+
+
+def _keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> None:
+    # A track that two segments share is kept as the more exact of the two knows it.
+    for i, x, c in zip(*points, strict=True):
+        if int(i) not in known or np.trace(c) < np.trace(known[int(i)][1]):
+            known[int(i)] = (x, c)

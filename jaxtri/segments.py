@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import adjoint, compose, multiply, shear
+from jaxtri.geometry.pose import adjoint, multiply
+from jaxtri.models.depth import Bank
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
-from jaxtri.tracker import Report, Settings, judge, median
+from jaxtri.tracker import Report, Settings, judge, median, structure_model
 from jaxtri.two_view import TwoView
 
 
@@ -38,6 +39,7 @@ class State(NamedTuple):
     epipole: Float[Array, "3"]
     depth: Float[Array, ""]
     coasted: Int[Array, ""]
+    structure: Bank  # a point per track, in the world
 
 
 def origin(dtype: jnp.dtype) -> Placement:
@@ -69,15 +71,17 @@ def init(
     depth = median(1 / jnp.where(inverse > 0, inverse, 1.0), mask & (inverse > 0))
     belief = start(two_view, frames=frames, velocity_sd=0.05 * depth, angular_velocity_sd=0.05)
     inside = mask & informative(belief.mean, pairs, settings.sigma, 2.0)
-    return State(belief, pairs, inside, placement, T, depth, jnp.asarray(0, jnp.int32))
+    model = structure_model(settings)
+    structure = model.plane(pairs[:, :2], placement.pose, depth)
+    state = State(belief, pairs, inside, placement, T, depth, jnp.asarray(0, jnp.int32), structure)
+    structure = model.step(structure, world_pose(state)[0], pairs[:, 2:], inside, own_covariance(state))
+    return state._replace(structure=structure)
 
 
 def world_pose(state: State) -> tuple[SE3, Float[Array, "6 6"]]:
     """Pose of the current frame, world to camera, and the covariance of its error (linear, angular)."""
     motion = state.belief.mean.motion
-    assert isinstance(motion.rotation, SO3)
-    relative = compose(motion.rotation, motion.translation)
-    T = motion.translation
+    relative, T = motion.pose, motion.translation
     scale = jnp.concatenate([T, jnp.zeros_like(T)])[:, None]
     G = jnp.concatenate([adjoint(relative), scale], axis=1)
     return multiply(relative, state.placement.pose), own_covariance(state) + G @ state.placement.covariance @ G.T
@@ -85,9 +89,7 @@ def world_pose(state: State) -> tuple[SE3, Float[Array, "6 6"]]:
 
 def own_covariance(state: State) -> Float[Array, "6 6"]:
     """Covariance of the current pose within its segment, as a left perturbation (linear, angular)."""
-    rows = jnp.array([0, 1, 2, 6, 7, 8])
-    J = shear(state.belief.mean.motion.translation)
-    return J @ state.belief.covariance[rows][:, rows] @ J.T
+    return state.belief.mean.motion.pose_covariance(state.belief.covariance)
 
 
 def place(pose: Float[Array, "6 6"], log_scale: Float[Array, ""]) -> Float[Array, "7 7"]:
@@ -112,8 +114,11 @@ def step(
     )
     belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, inside, state.coasted)
     drop = ok & inside & (diagnostics.distance > settings.outlier)
-    new = state._replace(belief=belief, inside=inside & ~drop, coasted=coasted)
+    inside = inside & ~drop
+    new = state._replace(belief=belief, inside=inside, coasted=coasted)
     pose, covariance = world_pose(new)
+    structure = structure_model(settings).step(state.structure, pose, observed, inside & ok, own_covariance(new), dt)
+    new = new._replace(structure=structure)
     return new, Report(pose, covariance, status, jnp.asarray(False), drop, diagnostics)
 
 

@@ -3,6 +3,9 @@
 `init` and `step` are pure functions on arrays of fixed capacity: a changing set of features is a changing
 mask. A keyframe is a frame whose pose is kept. Each track draws its two base frames from the keyframes, so
 there is no hand-over between segments: overlapping tracks carry the scale.
+
+Beside the pose runs the structure bank (`jaxtri.models.depth`): a point per track, born where the track
+begins, refined in every frame given the pose, and kept as it was when the track ends.
 """
 
 from enum import IntEnum
@@ -20,6 +23,7 @@ from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 from jaxtri.geometry.pose import multiply, relative
 from jaxtri.keyframes import Keyframes, add, carry, start, total
 from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_point
+from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Twist
 
 
@@ -103,6 +107,8 @@ class State(NamedTuple):
     held: Bool[Array, " n"]  # tracks unbroken since then
     depth: Float[Array, ""]  # median depth of the scene
     coasted: Int[Array, ""]  # frames since the last update
+    structure: Bank  # a point per track, refined in every frame given the pose
+    born: Bool[Array, " n"]  # tracks whose point stands in `structure`
 
 
 class Report(NamedTuple):
@@ -114,6 +120,11 @@ class Report(NamedTuple):
     keyframe: Bool[Array, ""]
     drop: Bool[Array, " n"]  # tracks that are outliers: their slots may be filled anew
     diagnostics: ekf.Diagnostics
+
+
+def structure_model(settings: Settings) -> Depth:
+    """The filters of the points, which are gated as the pose's are."""
+    return Depth.of(settings.sigma, gate=settings.robust.gate)
 
 
 def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
@@ -146,14 +157,16 @@ def init(
     base, lever, good, _ = jax.vmap(lambda a, b: _pair(settings, a, b, one, two))(first, second)
     good &= mask
     depth = median(1 / jnp.where(good, base.point[:, 3], 1.0), good)
-    kept = start(one, two, jnp.zeros((6, 6), dtype) if covariance is None else covariance, keyframes)
+    covariance = jnp.zeros((6, 6), dtype) if covariance is None else covariance
+    kept = start(one, two, covariance, keyframes)
     # The first pose is the gauge; the velocity is all but unknown.
     sd = jnp.repeat(jnp.stack([1e-6 * depth, jnp.asarray(1e-6, dtype), 0.05 * depth, jnp.asarray(0.05, dtype)]), 3)
     belief = ekf.Belief(Twist(one, jnp.zeros(6, dtype)), jnp.diag(sd**2))
     slots = jnp.stack([jnp.where(mask, 0, -1), jnp.where(good, 1, -1)], axis=-1).astype(jnp.int32)
     tracks = Tracks(first, slots, base, lever, good, good)
     sensitivity = jnp.zeros((12, 6 * keyframes), dtype)
-    return State(belief, tracks, kept, sensitivity, second, mask, depth, jnp.asarray(0, jnp.int32))
+    structure = structure_model(settings).plane(first, one, depth)
+    return State(belief, tracks, kept, sensitivity, second, mask, depth, jnp.asarray(0, jnp.int32), structure, mask)
 
 
 def judge(
@@ -269,6 +282,13 @@ def step(
     held = state.held & keep & ~drop
 
     flow = median(jnp.sqrt(jnp.sum((observed - state.seen) ** 2, axis=-1)), held)
+    points = structure_model(settings)
+    measured = state.born & keep & ~drop & ok
+    structure = points.step(state.structure, belief.mean.pose, observed, measured, belief.covariance[:6, :6], dt)
+    begins = visible & ~(state.born & keep) & ok
+    structure = points.born(structure, begins, observed, belief.mean.pose, state.depth)
+    born = (state.born & keep & ~drop) | begins
+
     live = jnp.sum(visible).astype(observed.dtype)
     usable = jnp.sum(tracks.usable).astype(observed.dtype)
     due = (flow > settings.keyframe_flow) | (jnp.sum(held) < settings.keyframe_common)
@@ -279,7 +299,7 @@ def step(
     depths = tracks.base.point[:, :3] @ belief.mean.pose.rotation().as_matrix()[2]
     depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
-    plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, coasted)
+    plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, coasted, structure, born)
     rebased = _rebase(settings, plain, observed, visible)
     new = jax.tree.map(lambda a, b: jnp.where(keyframe, a, b), rebased, plain)
     covariance = total(belief.covariance[:6, :6], state.keyframes, sensitivity)

@@ -19,6 +19,7 @@ class Tracks(NamedTuple):
     visible: np.ndarray  # (t, n)
     R: np.ndarray  # (t, 3, 3)
     centres: np.ndarray  # (t, 3)
+    points: np.ndarray  # (n, 3) in the world
 
     @property
     def T_world_camera(self) -> np.ndarray:
@@ -64,7 +65,7 @@ def make(
     visible = (X[..., 2] > 0.1) & (pixels > 0).all(-1) & (pixels < [640, 480]).all(-1)
     # A track that has left does not come back.
     visible = np.logical_and.accumulate(visible, axis=0) if visible[0].any() else visible
-    return Tracks(cam, pixels, visible, R, centres)
+    return Tracks(cam, pixels, visible, R, centres, points)
 
 
 def sideways(n: int = 30, **options) -> Tracks:
