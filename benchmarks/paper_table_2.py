@@ -1,0 +1,125 @@
+"""What does one more frame cost, and how does it grow with the number of points? The paper's table II.
+
+    python benchmarks/paper_table_2.py
+
+Time of a frame after the first ten, in a hot scan, all filters in turn within each round: medians over the
+rounds of the ratios to the pose-only filter. Upper table: ours as shipped and the others with the same
+passes. Lower table: one pass each, as published. Then the growth with the number of points: the slope of log
+time against log N.
+"""
+
+import time
+from pathlib import Path
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from contract import parser, report, table
+from jaxtyping import Array
+from paper_filters import draw, start_of
+from tqdm import tqdm
+
+jax.config.update("jax_enable_x64", True)
+
+from jaxtri.io import atomic_path  # noqa: E402
+
+# Names of the figures, methods of `paper_filters`, the paper's seconds.
+SHIPPED = {"pose": "pose", "pose_and_structure": "default", "ap": "ap_good", "two_step": "two_step_good"}
+PUBLISHED = {"pose": "paper_pose", "pose_and_structure": "paper", "ap": "ap_classic", "two_step": "two_step_classic"}
+SECONDS = {"pose": 1.56, "pose_and_structure": 1.67, "ap": 2.60, "two_step": 0.42}
+LABELS = {"pose": "pose", "pose_and_structure": "pose and structure", "ap": "A-P", "two_step": "two-step"}
+
+
+class Clock:
+    """A filter that has seen ten frames, ready to be timed over the next."""
+
+    def __init__(self, method: str, n: int, frames: int, seed: int) -> None:
+        e, view = jax.tree.map(lambda x: x[0], draw(seed, 1, n_points=n))
+        f = start_of(e, view, method)
+
+        def advance(carry: object, observed: Array) -> object:
+            return jax.lax.scan(lambda c, z: (f.step(c, z), None), carry, observed)[0]
+
+        run = jax.jit(advance)
+        self.frames = frames
+        self.carry, self.observed = run(f.carry, f.observed[:10]), f.observed[10 : 10 + frames]
+        self.run = run.lower(self.carry, self.observed).compile()
+        jax.block_until_ready(self.run(self.carry, self.observed))
+
+    def __call__(self) -> float:
+        """Seconds a frame."""
+        began = time.perf_counter()
+        jax.block_until_ready(self.run(self.carry, self.observed))
+        return (time.perf_counter() - began) / self.frames
+
+
+def measure(methods: dict[str, str], n: int, frames: int, rounds: int, seed: int) -> dict[str, np.ndarray]:
+    """Seconds a frame of each method in each round, interleaved."""
+    clocks = {name: Clock(method, n, frames, seed) for name, method in methods.items()}
+    times = {name: [] for name in methods}
+    for _ in range(rounds):
+        for name, clock in clocks.items():
+            times[name].append(clock())
+    return {name: np.array(x) for name, x in times.items()}
+
+
+def main() -> None:
+    args = parser(__doc__.splitlines()[0] if __doc__ else "").parse_args()
+    began = time.perf_counter()
+    n, frames, rounds = (100, 10, 3) if args.quick else (300, 87, 9)
+    figures: dict[str, float] = {}
+    for title, methods, prefix in (("as shipped", SHIPPED, ""), ("as published, one pass", PUBLISHED, "published_")):
+        times = measure(methods, n, frames, rounds, args.seed)
+        rows = []
+        for name, x in times.items():
+            ratio = float(np.median(x / times["pose"]))
+            figures[prefix + name] = ratio
+            figures[f"{prefix}{name}_ms"] = 1e3 * float(np.median(x))
+            paper = SECONDS[name] / SECONDS["pose"]
+            rows.append(
+                [LABELS[name], f"{1e3 * np.median(x):.3f}", f"{ratio:.2f}", f"{SECONDS[name]:.2f}", f"{paper:.2f}"]
+            )
+        print(f"One more frame, N = {n}, {title}\n")
+        print(table(["", "ms", "over pose", "the paper [s]", "over pose"], rows) + "\n")
+
+    sizes = (30, 100) if args.quick else (30, 100, 300, 1000, 3000)
+    growth: dict[str, dict[int, float]] = {name: {} for name in SHIPPED}
+    for size in tqdm(sizes, desc="growth", leave=False, disable=None):
+        for name, method in SHIPPED.items():
+            if name == "ap" and size > 1000:
+                continue  # 3000 points: a covariance of 72 MB and minutes a frame
+            few = name == "ap" and size == 1000
+            growth[name][size] = float(np.median(measure({name: method}, size, 2 if few else 20, 3, args.seed)[name]))
+    rows = []
+    for name, x in growth.items():
+        last = [k for k in x if k >= sizes[-1] / 30]
+        slope = np.polyfit(np.log(last), np.log([x[k] for k in last]), 1)[0]
+        figures |= {f"{name}_ms_n{k}": 1e3 * v for k, v in x.items()} | {f"{name}_growth": float(slope)}
+        rows.append([LABELS[name], *(f"{1e3 * x[k]:.2f}" if k in x else "" for k in sizes), f"N^{slope:.2f}"])
+    print(
+        "Growth: ms a frame, as shipped. The paper claims O(N^2) time and O(N) storage for ours (it inverts the 2N x 2N"
+    )
+    print("innovation), O(N^3) and O(N^2) for A-P; ours never forms it.\n")
+    print(table(["", *(f"N = {k}" for k in sizes), "slope"], rows))
+    print(f"\n{time.perf_counter() - began:.0f} s")
+    report(args.json, figures)
+    if args.plots is not None:
+        plot(growth, args.plots)
+
+
+def plot(growth: dict[str, dict[int, float]], out: Path) -> None:
+    """Time of a frame against the number of points."""
+    out.mkdir(parents=True, exist_ok=True)
+    figure, axis = plt.subplots(figsize=(6.5, 4.5), layout="constrained")
+    for name, x in growth.items():
+        axis.loglog(list(x), [1e3 * v for v in x.values()], "o-", label=LABELS[name])
+    axis.set(xlabel="points N", ylabel="time of one more frame [ms]")
+    axis.grid(alpha=0.3, which="both")
+    axis.legend()
+    with atomic_path(out / "table_2.png") as path:
+        figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
