@@ -18,8 +18,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
-from jaxtri.geometry.epipolar import homogeneous, inverse_depth
-from jaxtri.geometry.trifocal import project
+from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.two_view import TwoView
 
 
@@ -51,7 +50,7 @@ class Depth(eqx.Module):
     gate: Float[Array, ""]  # squared Mahalanobis distance of an innovation above which it is left out
     rays: bool = eqx.field(static=True, default=True)  # estimate the ray along with the parameter
     inverse: bool = eqx.field(static=True, default=True)  # the parameter is the inverse depth
-    passes: int = eqx.field(static=True, default=3)  # linearisations of an update
+    passes: int = eqx.field(static=True, default=2)  # linearisations of an update
 
     @classmethod
     def of(cls, sigma: Float[Array, ""], *, gate: Float[Array, ""] | float = jnp.inf, rays: bool = True) -> "Depth":
@@ -131,34 +130,37 @@ class Depth(eqx.Module):
 
         def one(parameter: Array, ray: Array, C: Array, birth: SE3, z: Array) -> tuple[Array, Array, Array]:
             R1, T1 = birth.rotation().as_matrix(), birth.translation()
+            A = R @ R1.T
+            b = T - A @ T1
             prior = jnp.concatenate([parameter[None], ray])
             C = C.at[0, 0].add(drift * jnp.square(parameter))
 
-            def predicted(x: Array) -> Array:
-                # The state, then the left perturbation of the pose to first order.
-                X = self._homogeneous(x[:3], R1, T1)
-                moved = R @ X[:3] + X[3] * T
-                moved = moved + X[3] * x[3:6] + jnp.cross(x[6:], moved)
-                return project(jnp.concatenate([moved, X[3:]]), jnp.eye(3, dtype=z.dtype), jnp.zeros(3, z.dtype))
+            def camera(x: Array) -> Array:
+                turned = A @ homogeneous(x[1:])
+                return turned + x[0] * b if self.inverse else x[0] * turned + b
 
-            def linearise(x: Array) -> tuple[Array, Array, Array, Array]:
-                full = jnp.concatenate([x, jnp.zeros(6, x.dtype)])
-                y, push = jax.linearize(predicted, full)
-                J = jax.vmap(push, out_axes=-1)(jnp.eye(9, dtype=x.dtype))
-                H, G = J[:, :3], J[:, 3:]
-                D = jnp.square(self.sigma) * jnp.eye(2, dtype=x.dtype) + G @ pose_covariance @ G.T
-                return z - y - H @ (prior - x), H, D, _inverse_2x2(H @ C @ H.T + D)
+            def moved(error: Array) -> Array:
+                # The left perturbation of the pose, to first order, of the point as it is believed.
+                X = camera(prior)
+                return dehomogenise(X + (parameter if self.inverse else 1.0) * error[:3] + jnp.cross(error[3:], X))
+
+            G = jax.jacfwd(moved)(jnp.zeros(6, z.dtype))
+            D = jnp.square(self.sigma) * jnp.eye(2, dtype=z.dtype) + G @ pose_covariance @ G.T
+
+            def linearise(x: Array) -> tuple[Array, Array, Array]:
+                """Innovation and Jacobian at x, and the inverse of the innovation's covariance."""
+                y, push = jax.linearize(lambda x: dehomogenise(camera(x)), x)
+                H = jax.vmap(push, out_axes=-1)(jnp.eye(3, dtype=x.dtype))
+                return z - y - H @ (prior - x), H, _inverse_2x2(H @ C @ H.T + D)
 
             def gain(H: Array, inverse: Array) -> Array:
                 K = C @ H.T @ inverse
                 return K if self.rays else K.at[1:].set(0.0)
 
-            r, H, D, inverse = linearise(prior)
+            r, H, inverse = linearise(prior)
             inside = r @ inverse @ r <= self.gate
-            x = prior
             for _ in range(self.passes - 1):
-                x = prior + gain(H, inverse) @ r
-                r, H, D, inverse = linearise(x)
+                r, H, inverse = linearise(prior + gain(H, inverse) @ r)
             K = gain(H, inverse)
             x = prior + K @ r
             # Joseph's form: positive whatever the gain, a considered ray's included.
