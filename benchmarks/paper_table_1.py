@@ -119,8 +119,8 @@ def main() -> None:
         rows.append([NAMES[method], *cells, f"{mean['total_rotation_deg']:.4f}", f"{percent[0]:.3f}",
                      f"{mean['translation_mm']:.3f}", f"{percent[1]:.3f}"])  # fmt: skip
         ours.append([NAMES[method], f"{mean['geodesic_deg']:.4f}", f"{over['rotation']:.2f}",
-                     f"{over['translation']:.2f}", f"{mean['nees']:.1f}", f"{np.median(kept['nees']):.1f}",
-                     f"{mean['depth_nees']:.2f}", f"{int(lost.sum())} of {count}",
+                     f"{over['translation']:.2f}", f"{mean['nees']:.3g}", f"{np.median(kept['nees']):.3g}",
+                     f"{mean['depth_nees']:.3g}", f"{int(lost.sum())} of {count}",
                      f"{PAPER['the paper, ours'][6] / mean['total_rotation_deg']:.0f}",
                      f"{PAPER_GEODESIC / mean['geodesic_deg']:.0f}"])  # fmt: skip
 
@@ -152,26 +152,32 @@ def _bound(e: Experiment, _: TwoView, frames: jax.Array) -> dict[str, jax.Array]
 
 
 def claims(f: dict[str, float]) -> str:
-    """Which of the paper's claims this run bears out."""
+    """Which of the paper's claims this run bears out: ratios of rotation errors, and a verdict."""
 
-    def worse(a: str, b: str) -> str:
-        if f"{a}.geodesic_deg" not in f or f"{b}.geodesic_deg" not in f:
-            return "diverged"
-        return f"{f[f'{a}.geodesic_deg'] / f[f'{b}.geodesic_deg']:.2g} times the rotation error of"
+    def ratio(a: str, b: str) -> str:
+        x = f.get(f"{a}.geodesic_deg", float("inf")) / f.get(f"{b}.geodesic_deg", float("nan"))
+        return f"{x:.2g} times the error" + (", holds" if x > 1.1 else ", does not hold" if x < 0.9 else ", level")
 
-    return "\n".join(
-        [
-            "The paper's claims, on these data:",
-            f"- more accurate than A-P and the two-step filter: as published (`paper` mode) only against their classic "
-            f"starts ({worse('ap_classic', 'paper')} `paper`, {worse('two_step_classic', 'paper')} `paper`).",
-            f"  With our start and iterations A-P is the most accurate of all ({worse('ap_good', 'default')} the "
-            f"default, {f.get('ap_good.rotation_over_bound', float('nan')):.2f} times the bound), at O(N^3); the",
-            f"  two-step filter is level with ours ({worse('two_step_good', 'default')} the default) but does not know "
-            f"how good it is (NEES {f.get('two_step_good.nees', float('nan')):.0f} of 6).",
-            "- structure out of the state helps convergence: true of one pass from a plane. It is the start and the",
-            "  iterations that decide, not the state.",
-        ]
-    )
+    def of(key: str) -> str:
+        return f"{f[key]:.3g}" if key in f else "none"
+
+    lines = [
+        "The paper's claims, on these data (rotation):",
+        "- `paper` mode is more accurate than the filters of its day as they were started then:",
+        f"    A-P, classic start: {ratio('ap_classic', 'paper')}",
+        f"    two-step, classic start: {ratio('two_step_classic', 'paper')}",
+        "- against the same filters with our start and our iterations it does not stand, nor did theirs need to:",
+        f"    A-P, good start: {ratio('ap_good', 'paper')}; two-step, good start: {ratio('two_step_good', 'paper')}",
+        "- our default against these:",
+        f"    A-P, good start: {ratio('ap_good', 'default')}; it is the reference, "
+        f"{of('ap_good.rotation_over_bound')} times the bound, at O(N^3)",
+        f"    two-step, good start: {ratio('two_step_good', 'default')}; its covariance is far too small, NEES "
+        f"{of('two_step_good.nees')} of 6",
+        "- why: a plane, one pass and exact rays make the baselines over-confident before the structure is known; with",
+        "  a good start that goes away, and keeping the structure in the state costs time, not accuracy. What one pass",
+        f"  and a constant R cost the trifocal filter: {ratio('paper', 'default').split(',')[0]} of the default.",
+    ]
+    return "\n".join(lines)
 
 
 def plot(found: dict[str, dict[str, np.ndarray]], bound: dict[str, np.ndarray], frames: np.ndarray, out: Path) -> None:

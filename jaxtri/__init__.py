@@ -17,6 +17,7 @@ Conventions, written here once:
 from jaxtri import ekf as ekf
 from jaxtri import segments as segments
 from jaxtri import tracker as tracker
+from jaxtri.bound import filtering_bound, smoothing_bound
 from jaxtri.ekf import Belief, Diagnostics, Robust
 from jaxtri.errors import (
     CameraError,
@@ -31,19 +32,24 @@ from jaxtri.errors import (
 )
 from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
 from jaxtri.models.base_pairs import BasePairs, BasePoint
+from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Kinematics, Twist
+from jaxtri.models.structure_and_motion import StructureAndMotion
 from jaxtri.models.trifocal import Trifocal, TrifocalState
+from jaxtri.models.two_step import TwoStep
 from jaxtri.tracker import Settings, Status
 from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
 from jaxtri.two_view import TwoView, refine
 
 __all__ = [
+    "Bank",
     "BasePairs",
     "BasePoint",
     "Belief",
     "BrownConrady",
     "Camera",
     "CameraError",
+    "Depth",
     "Diagnostics",
     "Fisheye",
     "InitialisationError",
@@ -54,6 +60,7 @@ __all__ = [
     "Robust",
     "Settings",
     "Status",
+    "StructureAndMotion",
     "Trajectory",
     "TrajectoryError",
     "Trifocal",
@@ -61,15 +68,18 @@ __all__ = [
     "TruncatedVideoError",
     "TruncatedVideoWarning",
     "Twist",
+    "TwoStep",
     "TwoView",
     "VideoError",
     "align",
     "ate_rmse",
     "ekf",
     "evaluate",
+    "filtering_bound",
     "nees",
     "refine",
     "relative_errors",
     "segments",
+    "smoothing_bound",
     "tracker",
 ]
