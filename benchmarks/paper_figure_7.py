@@ -6,6 +6,10 @@ The points are reprojected into every frame so far with the recovered poses; the
 points are summed over the frames, as in the paper (which gives 11 px for its own filter, 25 for A-P, more
 for the two-step filter, 13.86 px expected from the noise of 98 frames; here 97 follow the base pair). The
 noise floor is the same sum for the true points and poses. CPU time is that of the filter's own scan, hot.
+
+Last answer (2 cores, JAX 0.10, float64, 10 trials, --seed 2006; residual over the noise floor, CPU seconds for 97
+frames): default 1.003, .13; paper 10, .04; A-P classic 91, 1.9, good 1.12, 4.1; two-step classic 12, .02, good
+.988, .10.
 """
 
 import time

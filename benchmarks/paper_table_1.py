@@ -4,6 +4,16 @@
 
 300 points in 0.13 cubic metres at 0.33 m, 0.1 px at f = 600 px, 99 frames: pure translation, pure rotation,
 both. The paper's rows are its own draws of an experiment that it describes but in part.
+
+Last answer (2 cores, JAX 0.10, float64, 50 trials, --seed 2006; rotation in degrees, over the bound, translation
+in mm, NEES of the pose, of the depths):
+    default            .0049   1.51   .137       6.3   1.11
+    paper              .095   32     1.17   36,000    43
+    A-P, classic       .28    95    24.6       160
+    A-P, good          .0037   1.12   .128       7.1   2.5
+    two-step, classic  .22    23     2.8       380     2.0
+    two-step, good     .0062   2.2    .224     490    26
+The paper's own row: .2417 degrees in total, 30.6 mm. 9 minutes.
 """
 
 import time
@@ -68,7 +78,8 @@ def errors(e: Experiment, estimate: Estimate) -> dict[str, jax.Array]:
 
 def depth_nees(e: Experiment, estimate: Estimate) -> jax.Array:
     """Mean over the points of the normalised squared error of the inverse depth, a figure per frame."""
-    known = estimate.variance > 0  # all but the one that holds the scale of a plane
+    largest = jnp.max(estimate.variance, axis=-1, keepdims=True)
+    known = estimate.variance > 1e-9 * largest  # all but the one that holds the scale of a plane
     squared = (estimate.points[..., 3] - 1 / e.points[:, 2]) ** 2 / jnp.where(known, estimate.variance, 1.0)
     return jnp.sum(jnp.where(known, squared, 0.0), axis=-1) / jnp.sum(known, axis=-1)
 

@@ -51,7 +51,8 @@ def origin(dtype: jnp.dtype) -> Placement:
 def _model(settings: Settings, epipole: Float[Array, "3"], depth: Float[Array, ""]) -> Trifocal:
     drift = jnp.zeros((), settings.sigma.dtype)
     linear, angular = settings.acceleration * depth, settings.angular_acceleration
-    return Trifocal(settings.sigma, linear, angular, drift, epipole)
+    # On real video the estimate of the second base pose is worse than it says, and refining it helps.
+    return Trifocal(settings.sigma, linear, angular, drift, epipole, refine_base=True)
 
 
 def init(
