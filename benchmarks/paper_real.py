@@ -10,8 +10,8 @@ truth, which the paper did not have, says how far the object drifts: absolute er
 With --plots: the overlay video of each, three of its frames, the first, the middle and the last, and the
 pose over time beside the truth.
 
-Last answer (ATE in % of the path, as shipped / as published): desk .168 / .262, rig .127 / 1.98, flight .011 /
-.032, road .218 / .415.
+Last answer (ATE in % of the path, as shipped / as published): desk .168 / .267, rig .127 / .299, flight .011 /
+.024, road .218 / .437.
 """
 
 import warnings
