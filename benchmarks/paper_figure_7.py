@@ -33,10 +33,9 @@ FOCAL_PX = 600.0
 QUICK = ("default", "paper", "ap_good", "two_step_good")  # each method compiles twice
 
 
-def rms_px(points: jax.Array, R: jax.Array, T: jax.Array, observed: jax.Array) -> jax.Array:
-    """Root mean square distance over the points, pixels, a figure per frame."""
-    squared = jnp.sum((reproject(points, R, T) - observed) ** 2, axis=-1)
-    return FOCAL_PX * jnp.sqrt(jnp.mean(squared, axis=-1))
+def rms_px(difference: jax.Array) -> jax.Array:
+    """Root mean square distance over the points (t, n, 2), pixels, a figure per frame."""
+    return FOCAL_PX * jnp.sqrt(jnp.mean(jnp.sum(difference**2, axis=-1), axis=-1))
 
 
 def residual(e: Experiment, view: TwoView, method: str) -> dict[str, jax.Array]:
@@ -45,14 +44,10 @@ def residual(e: Experiment, view: TwoView, method: str) -> dict[str, jax.Array]:
     observed, frames = e.observed[2:], jnp.arange(len(estimate.T))
 
     def at(k: jax.Array) -> jax.Array:
-        each = rms_px(estimate.points[k], estimate.R, estimate.T, observed)
+        each = rms_px(reproject(estimate.points[k], estimate.R, estimate.T) - observed)
         return jnp.sum(jnp.where(frames <= k, each, 0.0))
 
-    squared = jnp.sum((e.clean[2:] - observed) ** 2, axis=-1)
-    return {
-        "residual": jax.lax.map(at, frames),
-        "floor": jnp.cumsum(FOCAL_PX * jnp.sqrt(jnp.mean(squared, axis=-1))),
-    }
+    return {"residual": jax.lax.map(at, frames), "floor": jnp.cumsum(rms_px(e.clean[2:] - observed))}
 
 
 def seconds(trials: Trials, method: str, repeats: int) -> float:

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxtri import ekf
-from jaxtri.geometry.epipolar import dehomogenise, homogeneous
-from jaxtri.geometry.pose import compose, shear
+from jaxtri.geometry.epipolar import homogeneous
+from jaxtri.geometry.trifocal import project
 from jaxtri.models import structure_and_motion as sam
 from jaxtri.models import two_step
 from jaxtri.models.depth import Bank, Depth, scale_variance, triangulate
@@ -131,9 +131,9 @@ def start_of(e: Experiment, view: TwoView, method: str) -> Filter:
     """A method at the start of a trial. Those named `pose` do without the points: `pose`, `paper_pose`."""
     if method.startswith("ap"):
         return _full_covariance(e, view, method == "ap_good")
-    return (
-        _two_step(e, view, method == "two_step_good") if method.startswith("two_step") else _trifocal(e, view, method)
-    )
+    if method.startswith("two_step"):
+        return _two_step(e, view, method == "two_step_good")
+    return _trifocal(e, view, method)
 
 
 def _trifocal(e: Experiment, view: TwoView, method: str) -> Filter:
@@ -150,8 +150,8 @@ def _trifocal(e: Experiment, view: TwoView, method: str) -> Filter:
     scale = scale_variance(view, first, second, mask, e.sigma)
     everything = jnp.ones(len(first), bool)
     bank = depth.plane(first, SE3.identity(), plane_depth(view, first, second))
-    J = shear(view.translation)
-    bank = depth.step(bank, compose(view.rotation, view.translation), second, everything, J @ view.covariance @ J.T)
+    moved: Kinematics = belief.mean.motion
+    bank = depth.step(bank, moved.pose, second, everything, moved.pose_covariance(belief.covariance))
 
     def step(carry: tuple[ekf.Belief, Bank | None], z: Array) -> tuple[ekf.Belief, Bank | None]:
         belief, bank = carry
@@ -230,5 +230,4 @@ def _fitted(e: Experiment, estimate: Estimate) -> Estimate:
 
 def reproject(points: Float[Array, "n 4"], R: Float[Array, "t 3 3"], T: Float[Array, "t 3"]) -> Float[Array, "t n 2"]:
     """Image points of homogeneous world points in all frames."""
-    X = jnp.einsum("tij,nj->tni", R, points[:, :3]) + points[:, 3][:, None] * T[:, None]
-    return dehomogenise(X)
+    return jax.vmap(lambda R, T: jax.vmap(lambda X: project(X, R, T))(points))(R, T)

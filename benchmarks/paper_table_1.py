@@ -177,7 +177,7 @@ def claims(f: dict[str, float]) -> str:
         "- `paper` mode is more accurate than the filters of its day as they were started then:",
         f"    A-P, classic start: {ratio('ap_classic', 'paper')}",
         f"    two-step, classic start: {ratio('two_step_classic', 'paper')}",
-        "- against the same filters with our start and our iterations it does not stand, nor did theirs need to:",
+        "- `paper` mode against the same filters with our start and our iterations:",
         f"    A-P, good start: {ratio('ap_good', 'paper')}; two-step, good start: {ratio('two_step_good', 'paper')}",
         "- our default against these:",
         f"    A-P, good start: {ratio('ap_good', 'default')}; it is the reference, "

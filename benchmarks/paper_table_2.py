@@ -32,8 +32,6 @@ SHIPPED = {"pose": "pose", "pose_and_structure": "default", "ap": "ap_good", "tw
 PUBLISHED = {"pose": "paper_pose", "pose_and_structure": "paper", "ap": "ap_classic", "two_step": "two_step_classic"}
 SECONDS = {"pose": 1.56, "pose_and_structure": 1.67, "ap": 2.60, "two_step": 0.42}
 LABELS = {"pose": "pose", "pose_and_structure": "pose and structure", "ap": "A-P", "two_step": "two-step"}
-
-
 CHUNK = 10  # frames in one call
 
 
@@ -55,7 +53,7 @@ class Clock:
         self()
 
     def __call__(self) -> float:
-        """Seconds a frame; starts over when the sequence is at its end."""
+        """Seconds a frame; the last ten frames again and again once the sequence is at its end."""
         last = len(self.observed) // CHUNK - 1
         at = min(self.seen, last) * CHUNK
         began = time.perf_counter()
