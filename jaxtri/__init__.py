@@ -15,6 +15,7 @@ Conventions, written here once:
 """
 
 from jaxtri import ekf as ekf
+from jaxtri import schmidt as schmidt
 from jaxtri import segments as segments
 from jaxtri import tracker as tracker
 from jaxtri.bound import filtering_bound, smoothing_bound
@@ -31,6 +32,7 @@ from jaxtri.errors import (
     VideoError,
 )
 from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
+from jaxtri.models.base_frames import BaseFrames, BaseFramesState
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Kinematics, Twist
@@ -43,6 +45,8 @@ from jaxtri.two_view import TwoView, refine
 
 __all__ = [
     "Bank",
+    "BaseFrames",
+    "BaseFramesState",
     "BasePairs",
     "BasePoint",
     "Belief",
@@ -79,6 +83,7 @@ __all__ = [
     "nees",
     "refine",
     "relative_errors",
+    "schmidt",
     "segments",
     "smoothing_bound",
     "tracker",

@@ -23,12 +23,8 @@ class Belief(eqx.Module, Generic[Mean]):
 
 
 @runtime_checkable
-class Model(Protocol[Mean]):
-    """What a filter asks of its problem; every method is a pure function of one item.
-
-    A model may also have an attribute `considered`, a boolean array (d,): error components that are counted
-    with their covariance and never corrected (consider parameters, Schmidt 1966).
-    """
+class Dynamics(Protocol[Mean]):
+    """The state of a filter and its motion; every method is a pure function."""
 
     def retract(self, mean: Mean, delta: Float[Array, " d"]) -> Mean:
         """The state moved by an error."""
@@ -45,6 +41,15 @@ class Model(Protocol[Mean]):
     def process_noise(self, mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
         """Covariance of what the motion model leaves out."""
         ...
+
+
+@runtime_checkable
+class Model(Dynamics[Mean], Protocol[Mean]):
+    """What a filter asks of its problem; every method is a pure function of one item.
+
+    A model may also have an attribute `considered`, a boolean array (d,): error components that are counted
+    with their covariance and never corrected (consider parameters, Schmidt 1966).
+    """
 
     def measure(self, mean: Mean, item: Any) -> Float[Array, " m"]:
         """Predicted measurement of one item."""
@@ -74,6 +79,13 @@ class Robust(eqx.Module):
     scale: Float[Array, ""] = eqx.field(default=16.0, converter=_number)
     gate: Float[Array, ""] = eqx.field(default=13.8, converter=_number)
 
+    def weights(self, distance: Float[Array, " n"], k: Int[Array, ""], passes: int) -> Float[Array, " n"]:
+        """Weights in pass k of `passes`, of items whose squared Mahalanobis distance is given."""
+        start, scale = self.start.astype(distance.dtype), self.scale.astype(distance.dtype)
+        share = k.astype(distance.dtype) / max(passes - 2, 1)
+        c = jnp.exp(jnp.log(start) + jnp.minimum(share, 1) * (jnp.log(scale) - jnp.log(start)))
+        return (1 + distance / c) ** -2
+
 
 class Diagnostics(eqx.Module):
     """What an update reports beside the belief.
@@ -98,7 +110,7 @@ class _Linearisation(eqx.Module):
     log_det: Float[Array, " n"]
 
 
-def _whiten(D: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[Array, ""]]:
+def whiten(D: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[Array, ""]]:
     """W with W D W' = I, and log det D, in closed form: batched LAPACK calls on tiny blocks are slow."""
     if D.shape[0] == 1:
         return 1 / jnp.sqrt(D), jnp.log(D[0, 0])
@@ -113,7 +125,7 @@ def _whiten(D: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[Array, "
     return W, jnp.log(a) + jnp.log(schur)
 
 
-def _replace_masked(mask: Bool[Array, " n"], items: PyTree, value: float) -> PyTree:
+def replace_masked(mask: Bool[Array, " n"], items: PyTree, value: float) -> PyTree:
     """Masked entries become `value` before any mathematics, so that a NaN in them changes nothing."""
 
     def replace(x: Array) -> Array:
@@ -123,7 +135,7 @@ def _replace_masked(mask: Bool[Array, " n"], items: PyTree, value: float) -> PyT
     return jax.tree.map(replace, items)
 
 
-def _stand_in(mask: Bool[Array, " n"], items: PyTree) -> PyTree:
+def stand_in(mask: Bool[Array, " n"], items: PyTree) -> PyTree:
     """Masked items become copies of an unmasked one, or zero where there is none.
 
     Not zero everywhere: a model may be singular there, and 0 * inf in its gradient would be NaN.
@@ -148,46 +160,56 @@ def _linearise(model: Model, prior: Any, delta: Array, items: PyTree, observed: 
     columns = jax.vmap(push, out_axes=-1)(jnp.eye(delta.size, dtype=delta.dtype))
     mean = model.retract(prior, delta)
     noise = jax.vmap(lambda item: model.noise(mean, item))(items)
-    whitener, log_det = jax.vmap(_whiten)(noise)
-    whitened = _replace_masked(mask, (observed - h, columns, whitener, log_det), 0.0)
+    whitener, log_det = jax.vmap(whiten)(noise)
+    whitened = replace_masked(mask, (observed - h, columns, whitener, log_det), 0.0)
     return _Linearisation(*whitened)
+
+
+def safe_root(weights: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Square root with a zero derivative at the zero of a masked item."""
+    positive = weights > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, weights, 1.0)), 0.0)
 
 
 def _normal_equations(lin: _Linearisation, weights: Array, delta: Array) -> tuple[Array, Array]:
     """A = sum w H' D^-1 H and b = sum w H' D^-1 (r + H delta): all that the items say, in d numbers."""
-    # Guarded: the square root has no derivative at the zero of a masked item.
-    positive = weights > 0
-    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, weights, 1.0)), 0.0)[:, None]
+    root = safe_root(weights)[:, None]
     H = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian) * root[..., None]
     r = jnp.einsum("nij,nj->ni", lin.whitener, lin.residual) * root
     H, r = H.reshape(-1, H.shape[-1]), r.reshape(-1)
     return H.T @ H, H.T @ (r + H @ delta)
 
 
-def _system(P: Array, A: Array) -> tuple[Array, Array, Array]:
-    """I + P A and P in coordinates scaled by the prior's standard deviations, and these.
+def _system(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
+    """I + P A, P and A in coordinates scaled by the prior's standard deviations, and these.
 
     Without scaling float32 does not survive; A alone is never inverted (a scale it does not see leaves it
     rank deficient), nor is P (a pinned direction has no uncertainty).
     """
     variance = jnp.diagonal(P)
     s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
-    Ps = P / jnp.outer(s, s)
-    return jnp.eye(s.size, dtype=P.dtype) + Ps @ (A * jnp.outer(s, s)), Ps, s
+    Ps, As = P / jnp.outer(s, s), A * jnp.outer(s, s)
+    return jnp.eye(s.size, dtype=P.dtype) + Ps @ As, Ps, As, s
 
 
-def _error(P: Array, A: Array, b: Array) -> Array:
-    """Posterior error (P^-1 + A)^-1 b, for a P that may be singular."""
-    M, Ps, s = _system(P, A)
+def posterior_error(P: Float[Array, "d d"], A: Float[Array, "d d"], b: Float[Array, " d"]) -> Float[Array, " d"]:
+    """(P^-1 + A)^-1 b, for a P that may be singular."""
+    M, Ps, _, s = _system(P, A)
     return jnp.linalg.solve(M, Ps @ (b * s)) * s
 
 
 def _posterior(P: Array, A: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Posterior error, its covariance (P^-1 + A)^-1, and log det (I + P A)."""
-    M, Ps, s = _system(P, A)
-    solved = jnp.linalg.solve(M, jnp.concatenate([Ps, (Ps @ (b * s))[:, None]], axis=1))
-    covariance = (solved[:, :-1] + solved[:, :-1].T) / 2
-    return solved[:, -1] * s, covariance * jnp.outer(s, s), jnp.linalg.slogdet(M)[1]
+    """Posterior error, its covariance (P^-1 + A)^-1, and log det (I + P A).
+
+    With X = (I + P A)^-1 the covariance is X P. Written as a sum of squares, X P X' + (X P) A (X P)', which is
+    Joseph's form, it stays positive when X is off by rounding: in float32 X P itself does not.
+    """
+    M, Ps, As, s = _system(P, A)
+    X = jnp.linalg.solve(M, jnp.eye(s.size, dtype=P.dtype))
+    XP = X @ Ps
+    covariance = XP @ X.T + XP @ As @ XP.T
+    error = XP @ (b * s)
+    return error * s, (covariance + covariance.T) / 2 * jnp.outer(s, s), jnp.linalg.slogdet(M)[1]
 
 
 def _distance(lin: _Linearisation) -> Array:
@@ -200,7 +222,7 @@ def _moved(lin: _Linearisation, step: Array) -> _Linearisation:
     return _Linearisation(residual, lin.jacobian, lin.whitener, lin.log_det)
 
 
-def transition(model: Model[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
+def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
     """Derivative of the error after one time step with respect to the error before it."""
     after = model.predict(mean, dt)
 
@@ -223,7 +245,7 @@ def information(
     weight zero count nothing.
     """
     mask = weights > 0
-    items = _stand_in(mask, items)
+    items = stand_in(mask, items)
     observed = jax.vmap(lambda item: model.measure(mean, item))(items)
     d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
     lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask)
@@ -258,17 +280,12 @@ def update(
     """
     P, prior = belief.covariance, belief.mean
     dtype = P.dtype
-    items = _stand_in(mask, items)
-    observed = _replace_masked(mask, observed, 0.0)
+    items = stand_in(mask, items)
+    observed = replace_masked(mask, observed, 0.0)
     valid = mask.astype(dtype)
 
     def weigh(lin: _Linearisation, k: Array) -> Array:
-        if robust is None:
-            return valid
-        start, scale = robust.start.astype(dtype), robust.scale.astype(dtype)
-        share = k.astype(dtype) / max(passes - 2, 1)
-        c = jnp.exp(jnp.log(start) + jnp.minimum(share, 1) * (jnp.log(scale) - jnp.log(start)))
-        return valid * (1 + _distance(lin) / c) ** -2
+        return valid if robust is None else valid * robust.weights(_distance(lin), k, passes)
 
     considered = getattr(model, "considered", None)
 
@@ -278,7 +295,7 @@ def update(
     def iterate(k: Array, delta: Array) -> Array:
         lin = _linearise(model, prior, delta, items, observed, mask)
         A, b = _normal_equations(lin, weigh(lin, k), delta)
-        return correct(_error(P, A, b))
+        return correct(posterior_error(P, A, b))
 
     # A loop, not an unrolled chain: unrolling multiplies the compile time by the number of passes.
     delta = jax.lax.fori_loop(0, passes - 1, iterate, jnp.zeros(P.shape[0], dtype))

@@ -109,3 +109,27 @@ def refine(
     enough = (jnp.sum(mask) >= 5) | (prior is not None)
     ok = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(x)) & known & enough
     return TwoView(T, R, covariance, rms, ok)
+
+
+def sensitivity(
+    two_view: TwoView,
+    u1: Float[Array, "n 2"],
+    u2: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    sigma: Float[Array, ""] | float,
+) -> Float[Array, "n 6 4"]:
+    """What the error of an estimate owes to those of its pairs: derivative of (T, R) with respect to (u1, u2).
+
+    Errors are truth minus estimate, or observation. `mask` and `sigma` are those of `refine`; zero where masked.
+    """
+    T, R = two_view.translation, two_view.rotation.as_matrix()
+
+    def distance(error: Float[Array, "6"], pair: Float[Array, "4"]) -> Array:
+        turned = R + jnp.cross(error[3:], R.T).T  # exp(error) R, to first order
+        return sampson(essential(turned, T + error[:3]), pair[:2], pair[2:])
+
+    pairs = jnp.concatenate([u1, u2], axis=-1)
+    pairs = jnp.where(mask[:, None], pairs, pairs[jnp.argmax(mask)])
+    of_pose, of_pair = jax.vmap(jax.grad(distance, argnums=(0, 1)), (None, 0))(jnp.zeros(6, T.dtype), pairs)
+    weight = mask.astype(T.dtype) / jnp.square(jnp.asarray(sigma, T.dtype))
+    return -jnp.einsum("n,ij,nj,nk->nik", weight, two_view.covariance, of_pose, of_pair)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxlie import SO3
 
-from jaxtri.synthetic.experiment import paper_experiment
+from jaxtri.synthetic.experiment import paper_experiment, steady_experiment
 
 
 def test_what_the_paper_states_holds(key):
@@ -49,3 +49,19 @@ def test_trials_are_batched(key):
     many = jax.jit(jax.vmap(partial(paper_experiment, n_points=5, n_frames=4)))(keys)
     alone = jax.jit(partial(paper_experiment, n_points=5, n_frames=4))(keys[1])
     np.testing.assert_allclose(many.observed[1], alone.observed, rtol=1e-12)
+
+
+def test_a_steady_camera_moves_as_told(key):
+    still = {"jitter_m": 0.0, "jitter_degrees": 0.0, "n_frames": 20, "n_points": 10}
+    forward = steady_experiment(key, metres_per_frame=(0.0, 0.0, 0.01), **still)
+    np.testing.assert_allclose(forward.translations[:, 2], 0.01 * np.arange(20), atol=1e-12)
+    np.testing.assert_allclose(forward.rotations, np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-12)
+    orbit = steady_experiment(key, degrees_per_frame=(0.0, 0.7, 0.0), orbit=True, distance_m=2.0, **still)
+    centre = orbit.rotations @ np.array([0, 0, 2.0]) + orbit.translations
+    np.testing.assert_allclose(centre, np.broadcast_to([0, 0, 2.0], (20, 3)), atol=1e-12)
+    cosine = (np.trace(orbit.rotations, axis1=1, axis2=2) - 1) / 2
+    np.testing.assert_allclose(np.rad2deg(np.arccos(cosine[1:])), 0.7 * np.arange(1, 20), rtol=1e-6)
+    turn = steady_experiment(key, degrees_per_frame=(0.0, 0.3, 0.0), **still)
+    np.testing.assert_allclose(turn.translations, 0, atol=1e-12)
+    noisy = steady_experiment(key, n_points=400, noise_px=0.5)
+    np.testing.assert_allclose(np.std(noisy.observed - noisy.clean), 0.5 / 600, rtol=0.02)

@@ -1,9 +1,9 @@
 """The paper's filter: the pose of a camera, measured by the trifocal transfer from two base frames.
 
-The structure of the scene is not in the state: a frame costs O(N). One code path serves three modes that
-differ in what they hold, not in what they do: `default` (SO(3), base noise in R, several passes, the second
-base pose considered), `paper` (yaw-pitch-roll, constant R, one pass, the second base pose refined) and,
-later, a consistent one.
+The structure of the scene is not in the state: a frame costs O(N). Three modes: `default` (SO(3), base noise
+in R, several passes, the second base pose considered), `paper` (yaw-pitch-roll, constant R, one pass, the
+second base pose refined), and `consistent`, the default's model under `jaxtri.schmidt`: the noise of the base
+points considered, so that every frame may refine the second base pose and nothing is counted twice.
 """
 
 from typing import NamedTuple
@@ -15,12 +15,14 @@ import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri import schmidt
 from jaxtri.ekf import Belief
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
 from jaxtri.geometry.pose import local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
 from jaxtri.models.motion import Kinematics, acceleration_noise, from_two_view
-from jaxtri.two_view import TwoView
+from jaxtri.schmidt import Measured
+from jaxtri.two_view import TwoView, sensitivity
 
 
 class Mode(NamedTuple):
@@ -114,6 +116,24 @@ class Trifocal(eqx.Module):
             noise = noise + J @ J.T
         return jnp.square(self.sigma) * noise
 
+    def measured(self, mean: TrifocalState, items: Float[Array, "n 4"], moved: Float[Array, "n 4"]) -> Measured:
+        """All transferred points, for `jaxtri.schmidt`: the noise of the base points is an error of the items."""
+        pairs = items + moved
+
+        def predicted(error: Array) -> Array:
+            mean_ = self.retract(mean, error)
+            return jax.vmap(lambda pair: self._transfer(mean_, pair))(pairs)
+
+        zero = jnp.zeros(18, items.dtype)
+        y, push = jax.linearize(predicted, zero)
+        H = jax.vmap(push, out_axes=-1)(jnp.eye(18, dtype=items.dtype))
+        J = jax.vmap(jax.jacfwd(lambda pair: self._transfer(mean, pair)))(pairs)
+        return Measured(y, H, J)
+
+    def item_noise(self, mean: TrifocalState, items: Float[Array, "n 4"]) -> Float[Array, "n 4 4"]:
+        """That of the base points."""
+        return jnp.broadcast_to(jnp.square(self.sigma) * jnp.eye(4, dtype=items.dtype), (len(items), 4, 4))
+
 
 def start(
     two_view: TwoView,
@@ -135,6 +155,29 @@ def start(
     state = TrifocalState(motion, motion.translation, motion.rotation)
     E = jnp.concatenate([lever, jnp.eye(6, dtype=lever.dtype)])
     return Belief(state, E @ C @ E.T + jnp.diag(jnp.pad(variance, (0, 6))))
+
+
+def consistent_start(
+    two_view: TwoView,
+    pairs: Float[Array, "n 4"],
+    mask: Bool[Array, " n"],
+    sigma: Float[Array, ""],
+    *,
+    frames: Float[Array, ""] | float = 1.0,
+    velocity_sd: Float[Array, ""] | float,
+    angular_velocity_sd: Float[Array, ""] | float,
+) -> schmidt.Belief[TrifocalState]:
+    """As `start`, for `jaxtri.schmidt` with the pairs as items: the pose owes its error to their noise.
+
+    `mask` marks the pairs that the two-view estimate was made from, all of its data.
+    """
+    motion, _, lever, variance = from_two_view(
+        two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd
+    )
+    state = TrifocalState(motion, motion.translation, motion.rotation)
+    E = jnp.concatenate([lever, jnp.eye(6, dtype=lever.dtype)])
+    S = sensitivity(two_view, pairs[:, :2], pairs[:, 2:], mask, sigma)
+    return schmidt.Belief(state, jnp.diag(jnp.pad(variance, (0, 6))), jnp.einsum("de,nep->dnp", E, S))
 
 
 def informative(

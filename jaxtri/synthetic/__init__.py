@@ -1,6 +1,6 @@
 """Sequences with exact truth: the paper's synthetic experiment from a key, and a small renderer of scenes."""
 
-from jaxtri.synthetic.experiment import Experiment, paper_experiment
+from jaxtri.synthetic.experiment import Experiment, paper_experiment, steady_experiment
 from jaxtri.synthetic.laboratory import Footage, blank_scene, laboratory, planar_scene
 from jaxtri.synthetic.scene import Quad, Rendering, Scene, box, quad, render, rendered_sequence
 
@@ -18,4 +18,5 @@ __all__ = [
     "quad",
     "render",
     "rendered_sequence",
+    "steady_experiment",
 ]

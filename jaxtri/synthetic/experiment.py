@@ -69,13 +69,56 @@ def paper_experiment(
 
     first = (SO3.identity(), centre)
     _, (rotations, translations) = jax.lax.scan(move, first, (turn, shift))
+    e = _observed(k_noise, points, rotations, translations, jnp.asarray(noise_px * pixel_mm / focal_mm))
+    if base_line is not None:
+        scale = base_line / jnp.linalg.norm(e.translations[1])
+        e = e._replace(points=scale * e.points, translations=scale * e.translations)
+    return e
+
+
+def steady_experiment(
+    key: PRNGKeyArray,
+    *,
+    metres_per_frame: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    degrees_per_frame: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    orbit: bool = False,
+    n_points: int = 300,
+    n_frames: int = 99,
+    side_m: float = 0.5,
+    distance_m: float = 1.0,
+    jitter_m: float = 1e-3,
+    jitter_degrees: float = 0.1,
+    noise_px: float = 0.1,
+    focal_px: float = 600.0,
+) -> Experiment:
+    """A cube of points before a camera that moves steadily, but for white jitter, in its own axes.
+
+    The velocities are those of the points in the camera: (0, 0, .01) recedes from the cube by a centimetre a
+    frame. With `orbit` the rotation is about the centre of the cube.
+    """
+    k_points, k_turn, k_shift, k_noise = jax.random.split(key, 4)
+    centre = jnp.array([0.0, 0.0, distance_m])
+    points = centre + jax.random.uniform(k_points, (n_points, 3), minval=-side_m / 2, maxval=side_m / 2)
+    turn = jitter_degrees * jax.random.normal(k_turn, (n_frames - 1, 3)) + jnp.array(degrees_per_frame)
+    shift = jitter_m * jax.random.normal(k_shift, (n_frames - 1, 3)) + jnp.array(metres_per_frame)
+
+    def move(carry: tuple[SO3, Array], rates: tuple[Array, Array]) -> tuple[tuple[SO3, Array], tuple[Array, Array]]:
+        rotation, T = carry
+        step = SO3.exp(jnp.deg2rad(rates[0]))
+        about = rotation @ centre + T if orbit else jnp.zeros(3)
+        rotation, T = (step @ rotation).normalize(), step @ (T - about) + about + rates[1]
+        return (rotation, T), (rotation.as_matrix(), T)
+
+    first = (SO3.identity(), jnp.zeros(3))
+    _, (rotations, translations) = jax.lax.scan(move, first, (turn, shift))
+    return _observed(k_noise, points, rotations, translations, jnp.asarray(noise_px / focal_px))
+
+
+def _observed(key: PRNGKeyArray, points: Array, rotations: Array, translations: Array, sigma: Array) -> Experiment:
+    """What is seen of the points; the poses are those of all frames but the first."""
     rotations = jnp.concatenate([jnp.eye(3)[None], rotations])
     translations = jnp.concatenate([jnp.zeros((1, 3)), translations])
     camera = jnp.einsum("tij,nj->tni", rotations, points) + translations[:, None]
     clean = camera[..., :2] / camera[..., 2:]
-    sigma = jnp.asarray(noise_px * pixel_mm / focal_mm)
-    observed = clean + sigma * jax.random.normal(k_noise, clean.shape)
-    if base_line is not None:
-        scale = base_line / jnp.linalg.norm(translations[1])
-        points, translations = scale * points, scale * translations
+    observed = clean + sigma * jax.random.normal(key, clean.shape)
     return Experiment(points, rotations, translations, clean, observed, sigma)

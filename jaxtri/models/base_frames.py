@@ -1,0 +1,284 @@
+"""The transfer from K base frames: the pose of a camera and of its base frames, and points that stand on these.
+
+The trifocal filter knows a point from a pair of base frames. Here the pair's point goes on: whatever frame is
+made a base frame adds its observation to the point by least squares, given the base poses, which are in the
+state. The structure itself is not: a point is a linear function of the errors of the base poses (`lever`) and
+an error of its own, which `jaxtri.schmidt` considers. So a frame costs O(N), no information of a base frame is
+lost and none is counted twice. With the pair alone it is the trifocal filter, to first order.
+
+A point may begin in any base frame, with a prior on its inverse depth. A base frame that makes room for
+another is written as a function of those that stay; what these do not know of it becomes an error of the
+points.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtri import schmidt
+from jaxtri.ekf import Diagnostics, Robust
+from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
+from jaxtri.geometry.pose import local, retract, shear
+from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, from_two_view, twist_noise
+from jaxtri.schmidt import Belief, Measured
+from jaxtri.two_view import TwoView, sensitivity
+
+
+class Points(NamedTuple):
+    """Homogeneous world points; b = 6 (K - 1) errors of the base poses but the first, which is the world."""
+
+    point: Float[Array, "n 4"]
+    basis: Float[Array, "n 4 3"]  # where an error takes it: image point and inverse depth, where it was first seen
+    lever: Float[Array, "n 3 b"]  # what its error owes to those of the base poses
+    noise: Float[Array, "n 3 3"]  # covariance of the rest, in units of sigma^2
+
+
+class BaseFramesState(eqx.Module):
+    """The current pose with its velocity, the base poses, and the points that move with these."""
+
+    motion: Kinematics | Twist
+    bases: SE3  # (k - 1,) base frames 2 to K, world to camera; errors are left perturbations
+    points: Points
+
+
+class BaseFrames(eqx.Module):
+    """Model of `jaxtri.schmidt` without items: the points are part of the state. Every field is a leaf."""
+
+    sigma: Float[Array, ""]  # noise of an image point, normalised image units
+    acceleration: Float[Array, ""]  # scene units per frame^2
+    angular_acceleration: Float[Array, ""]  # radians per frame^2
+
+    def retract(self, mean: BaseFramesState, delta: Float[Array, " d"]) -> BaseFramesState:
+        """The state moved by an error, the points with their base frames."""
+        bases = jax.vmap(retract)(mean.bases, delta[12:].reshape(-1, 6))
+        p = mean.points
+        point = p.point + jnp.einsum("nij,njb,b->ni", p.basis, p.lever, delta[12:])
+        return BaseFramesState(retract(mean.motion, delta[:12]), bases, p._replace(point=point))
+
+    def local(self, mean: BaseFramesState, other: BaseFramesState) -> Float[Array, " d"]:
+        """The error that takes `mean` to `other`."""
+        bases = jax.vmap(local)(mean.bases, other.bases).reshape(-1)
+        return jnp.concatenate([local(mean.motion, other.motion), bases])
+
+    def predict(self, mean: BaseFramesState, dt: Float[Array, ""]) -> BaseFramesState:
+        """Constant velocity; base frames and points stay."""
+        return BaseFramesState(mean.motion.advance(dt), mean.bases, mean.points)
+
+    def process_noise(self, mean: BaseFramesState, dt: Float[Array, ""]) -> Float[Array, "d d"]:
+        """White acceleration."""
+        noise = twist_noise if isinstance(mean.motion, Twist) else acceleration_noise
+        return jnp.pad(noise(self.acceleration, self.angular_acceleration, dt), (0, mean.points.lever.shape[2]))
+
+    def measured(self, mean: BaseFramesState, items: None, moved: Float[Array, "n 3"]) -> Measured:
+        """All points in the current view."""
+        p, motion = mean.points, mean.motion
+        pose = motion.pose
+        # The error of the pose, as a left perturbation, owes to that of the motion alone.
+        onto = jax.jacfwd(lambda e: local(pose, retract(motion, e).pose))(jnp.zeros(12, p.point.dtype))
+
+        def one(point: Array, basis: Array, lever: Array, m: Array) -> tuple[Array, Array, Array]:
+            y, A, B = _derivatives(pose, point + basis @ m, basis)
+            return y, jnp.concatenate([A @ onto, B @ lever], axis=1), B
+
+        y, H, B = jax.vmap(one)(p.point, p.basis, p.lever, moved)
+        return Measured(y, H, B)
+
+    def item_noise(self, mean: BaseFramesState, items: None) -> Float[Array, "n 3 3"]:
+        """What the base poses have no part in."""
+        return jnp.square(self.sigma) * mean.points.noise
+
+
+def _derivatives(
+    pose: SE3, X: Float[Array, "4"], basis: Float[Array, "4 3"]
+) -> tuple[Float[Array, "2"], Float[Array, "2 6"], Float[Array, "2 3"]]:
+    """Image point, and its derivatives with respect to a left perturbation of the pose and an error of the point."""
+    R, T, eye = pose.rotation().as_matrix(), pose.translation(), jnp.eye(3, dtype=X.dtype)
+    x = R @ X[:3] + X[3] * T
+    J = jax.jacfwd(dehomogenise)(x)
+    A = jnp.concatenate([X[3] * eye, jnp.cross(eye, x).T], axis=1)
+    return dehomogenise(x), J @ A, J @ (R @ basis[:3] + jnp.outer(T, basis[3]))
+
+
+def start(
+    two_view: TwoView,
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    sigma: Float[Array, ""],
+    k: int,
+    *,
+    frames: Float[Array, ""] | float = 1.0,
+    velocity_sd: Float[Array, ""] | float,
+    angular_velocity_sd: Float[Array, ""] | float,
+) -> Belief[BaseFramesState]:
+    """The belief at the second of `k` base frames, `frames` after the first, from a two-view estimate.
+
+    `mask` marks the pairs that it was made from. The points are those of the transfer (Yu et al. 2006, eqs 7-9).
+    """
+    motion, _, lever, variance = from_two_view(
+        two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd
+    )
+    pose, dtype, n, b = motion.pose, first.dtype, len(first), 6 * (k - 1)
+    pairs = jnp.concatenate([first, second], axis=-1)
+    pairs = jnp.where(mask[:, None], pairs, pairs[jnp.argmax(mask)])
+
+    def depth(pair: Float[Array, "4"], error: Float[Array, "6"]) -> Array:
+        two = retract(pose, error)
+        T = two.translation()
+        return inverse_depth(pair[:2], pair[2:], two.rotation().as_matrix(), T, T)
+
+    value, (by_pair, by_pose) = jax.vmap(jax.value_and_grad(depth, (0, 1)), (0, None))(pairs, jnp.zeros(6, dtype))
+    point = jnp.concatenate([pairs[:, :2], jnp.ones((n, 1), dtype), value[:, None]], axis=1)
+    M = jnp.broadcast_to(jnp.eye(3, 4, dtype=dtype), (n, 3, 4)).at[:, 2].set(by_pair)
+    Q = M @ M.mT
+    basis = jnp.eye(4, dtype=dtype)[:, jnp.array([0, 1, 3])]
+    points = Points(point, jnp.broadcast_to(basis, (n, 4, 3)), jnp.zeros((n, 3, b), dtype).at[:, 2, :6].set(by_pose), Q)
+    bases = jax.tree.map(lambda x: jnp.broadcast_to(x, (k - 1, *x.shape)), pose)
+    # What the estimate owes to the pairs: by way of the points' errors, and the rest.
+    onto = jnp.zeros((12 + b, 6), dtype).at[:12].set(lever).at[12:18].set(shear(pose.translation()))
+    S = jnp.einsum("de,nep->dnp", onto, sensitivity(two_view, first, second, mask, sigma))
+    by_points = jnp.einsum("dnp,niq,nqp->dni", S, jnp.linalg.inv(Q), M)
+    rest = (S - jnp.einsum("dni,nip->dnp", by_points, M)).reshape(12 + b, -1)
+    own = jnp.diag(jnp.pad(variance, (0, b))) + jnp.square(sigma) * rest @ rest.T
+    return Belief(BaseFramesState(motion, bases, points), own, by_points)
+
+
+def release(model: BaseFrames, belief: Belief[BaseFramesState], slot: Int[Array, ""]) -> Belief[BaseFramesState]:
+    """The belief without the base frame in `slot` (0 to K - 2), which then holds nothing.
+
+    Its error is written as a linear function of those of the other base frames; the remainder becomes an error
+    of the points, each its own.
+    """
+    p, dtype = belief.mean.points, belief.own.dtype
+    b = p.lever.shape[2]
+    Q = model.item_noise(belief.mean, None)
+    P = belief.covariance(Q)[12:, 12:]
+    at = 6 * slot + jnp.arange(6)
+    others = jnp.ones(b, dtype).at[at].set(0.0)
+    variance = jnp.diagonal(P)
+    s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
+    scaled = P / jnp.outer(s, s)
+    # Any regression is right, its remainder being what it is; a ridge makes it one where P is singular.
+    ridge = 10 * b * jnp.finfo(dtype).eps
+    within = scaled * jnp.outer(others, others) + jnp.diag(ridge + (1 - others))
+    Phi = jnp.linalg.solve(within, (scaled[at] * others).T).T
+    Phi = jnp.where(variance[at, None] > 0, s[at, None] * Phi / s * others, 0.0)
+    remainder = jnp.eye(b, dtype=dtype)[at] - Phi
+    left = remainder @ P @ remainder.T
+    onto = p.lever[:, :, at]
+    more = onto @ left @ onto.mT
+    T = jnp.linalg.solve(Q + more, Q).mT
+    keep = jnp.eye(3, dtype=dtype) - T
+    lost = keep @ Q @ keep.mT + T @ more @ T.mT
+    lever = (p.lever * others) + onto @ Phi
+    points = p._replace(lever=lever, noise=p.noise + more / jnp.square(model.sigma))
+    own = belief.own + schmidt.owed(belief.sensitivity, lost)
+    kept = jnp.concatenate([jnp.ones(12, dtype), others])
+    mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
+    return Belief(
+        mean, own * jnp.outer(kept, kept), jnp.einsum("dnp,npq->dnq", belief.sensitivity, T) * kept[:, None, None]
+    )
+
+
+def forget(model: BaseFrames, belief: Belief[BaseFramesState], gone: Bool[Array, " n"]) -> Belief[BaseFramesState]:
+    """The belief without the points that are `gone`; what the state owes to their errors it keeps as its own."""
+    S = jnp.where(gone[:, None], belief.sensitivity, 0.0)
+    own = belief.own + schmidt.owed(S, model.item_noise(belief.mean, None))
+    return Belief(belief.mean, own, belief.sensitivity - S)
+
+
+def promote(
+    belief: Belief[BaseFramesState], slot: Int[Array, ""], absorbed: Bool[Array, " n"], said: schmidt.ItemUpdate
+) -> Belief[BaseFramesState]:
+    """The belief with the current pose as a base frame in `slot`, which must be empty.
+
+    `absorbed` marks the points whose measurement joins their estimate, as `said` by the update.
+    """
+    mean, p = belief.mean, belief.mean.points
+    pose, dtype = mean.motion.pose, belief.own.dtype
+    at = 6 * slot + jnp.arange(6)
+    onto = jax.jacfwd(lambda e: local(pose, retract(mean.motion, e).pose))(jnp.zeros(12, dtype))
+
+    def one(point: Array, basis: Array, lever: Array, Q: Array, moved: Array, k: Array, B: Array) -> Points:
+        point = point + basis @ moved
+        _, A, _ = _derivatives(pose, point, basis)
+        keep = jnp.eye(3, dtype=dtype) - k @ B
+        lever = (keep @ lever).at[:, at].add(-k @ A)
+        return Points(point, basis, lever, keep @ Q @ keep.T + k @ k.T)
+
+    new = jax.vmap(one)(p.point, p.basis, p.lever, p.noise, said.moved, said.gain, said.at.spread)
+    points = jax.tree.map(lambda a, b: jnp.where(absorbed.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, p)
+    bases = jax.tree.map(lambda all_, x: all_.at[slot].set(x), mean.bases, pose)
+    rows = 12 + at
+    own = belief.own.at[rows].set(onto @ belief.own[:12])
+    own = own.at[:, rows].set(own[:, :12] @ onto.T)
+    S = belief.sensitivity.at[rows].set(jnp.einsum("ed,dnp->enp", onto, belief.sensitivity[:12]))
+    return Belief(BaseFramesState(mean.motion, bases, points), own, S)
+
+
+def begin(
+    model: BaseFrames,
+    belief: Belief[BaseFramesState],
+    slot: Int[Array, ""],
+    observed: Float[Array, "n 2"],
+    fresh: Bool[Array, " n"],
+    inverse_depth: Float[Array, ""],
+) -> Belief[BaseFramesState]:
+    """The belief with new points, first seen from the base frame in `slot`, the current pose.
+
+    Their inverse depth is the given one, give or take as much. The state owes nothing to them yet; points that
+    they replace are to be forgotten first.
+    """
+    pose, p, dtype = belief.mean.motion.pose, belief.mean.points, belief.own.dtype
+    R, T, eye = pose.rotation().as_matrix(), pose.translation(), jnp.eye(3, dtype=dtype)
+    at = 6 * slot + jnp.arange(6)
+    noise = jnp.diag(jnp.stack([jnp.ones((), dtype), jnp.ones((), dtype), jnp.square(inverse_depth / model.sigma)]))
+    # From (u, 1, inverse depth) in the camera to the world.
+    back = jnp.block([[R.T, -(R.T @ T)[:, None]], [jnp.zeros((1, 3), dtype), jnp.ones((1, 1), dtype)]])
+
+    def one(u: Float[Array, "2"]) -> tuple[Array, Array]:
+        x = homogeneous(u)
+        # A perturbed pose takes x elsewhere; then its last component is made one again.
+        turned = jnp.concatenate([inverse_depth * eye, jnp.cross(eye, x).T], axis=1)
+        image = jnp.concatenate([turned[:2] - jnp.outer(u, turned[2]), -inverse_depth * turned[2:]])
+        return back @ jnp.append(x, inverse_depth), -image
+
+    point, lever = jax.vmap(one)(observed)
+    basis = jnp.broadcast_to(back[:, jnp.array([0, 1, 3])], p.basis.shape)
+    b = p.lever.shape[2]
+    lever = jnp.zeros((len(observed), 3, b), dtype).at[:, :, at].set(lever)
+    new = Points(point, basis, lever, jnp.broadcast_to(noise, p.noise.shape))
+    points = jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, p)
+    mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
+    return Belief(mean, belief.own, jnp.where(fresh[:, None], 0.0, belief.sensitivity))
+
+
+def step(
+    model: BaseFrames,
+    belief: Belief[BaseFramesState],
+    observed: Float[Array, "n 2"],
+    mask: Bool[Array, " n"],
+    base: Bool[Array, ""],
+    slot: Int[Array, ""],
+    dt: Float[Array, ""] | float = 1.0,
+    *,
+    passes: int = 4,
+    robust: Robust | None = None,
+) -> tuple[Belief[BaseFramesState], Diagnostics]:
+    """One frame, which becomes the base frame in `slot` if `base` says so; what the slot held makes room.
+
+    A branch, not a choice between two results: what is not taken costs nothing (but under vmap).
+    """
+    predicted = schmidt.predict(model, belief, dt)
+    ready = jax.lax.cond(base, lambda x: release(model, x, slot), lambda x: x, predicted)
+    absorb = mask & base
+    updated, diagnostics, said = schmidt.update(
+        model, ready, None, observed, mask, absorb=absorb, passes=passes, robust=robust
+    )
+    if robust is not None:
+        absorb &= diagnostics.weights > 0
+    return jax.lax.cond(base, lambda x: promote(x, slot, absorb, said), lambda x: x, updated), diagnostics

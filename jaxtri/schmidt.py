@@ -1,0 +1,282 @@
+"""An extended Kalman filter whose items have an error of their own that every frame meets again.
+
+A point that stands on a few base frames brings the same error to all later ones. Taken for new each time it
+makes a filter over-confident; put into the state it costs O(N^3). Here it is *considered* (Schmidt 1966): not
+corrected, but counted with all that it has in common with the state, O(N d^2) a frame.
+
+The error of the state is kept as a sum, its own and `sensitivity` times the errors m of the items. So its
+covariance is a sum of squares and stays positive, in float32 too; the textbook form carries the
+cross-covariances instead and subtracts.
+
+Where to linearise is sought for state and items together: derivatives taken at an item that is wrong by m
+have an error in common with the innovation, which m is part of, and it adds up to a drift of the scale.
+"""
+
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxtri import ekf
+from jaxtri.ekf import Diagnostics, Robust
+
+Mean = TypeVar("Mean")
+
+
+class Belief(eqx.Module, Generic[Mean]):
+    """A Gaussian on a manifold: the true state is `retract(mean, e)`, e ~ N(0, own) + sum_i sensitivity_i m_i."""
+
+    mean: Mean
+    own: Float[Array, "d d"]  # covariance of what the items have no part in
+    sensitivity: Float[Array, "d n p"]
+
+    def covariance(self, noise: Float[Array, "n p p"]) -> Float[Array, "d d"]:
+        """Covariance of the whole error, given those of the items."""
+        return self.own + owed(self.sensitivity, noise)
+
+
+class Measured(NamedTuple):
+    """The measurements of all items and their derivatives."""
+
+    predicted: Float[Array, "n m"]
+    jacobian: Float[Array, "n m d"]  # with respect to the error of the state
+    spread: Float[Array, "n m p"]  # with respect to the error of the item
+
+
+@runtime_checkable
+class Model(ekf.Dynamics[Mean], Protocol[Mean]):
+    """What this filter asks of its problem: as `jaxtri.ekf.Model`, but for the measurements, all at once."""
+
+    sigma: Float[Array, ""]  # of a component of a measurement
+
+    def measured(self, mean: Mean, items: Any, moved: Float[Array, "n p"]) -> Measured:
+        """The measurements of items moved by an error."""
+        ...
+
+    def item_noise(self, mean: Mean, items: Any) -> Float[Array, "n p p"]:
+        """Covariances of the errors of all items, finite for those too that are never seen."""
+        ...
+
+
+class ItemUpdate(NamedTuple):
+    """What a frame says of the items, the state being as it is: least squares, item by item."""
+
+    moved: Float[Array, "n p"]  # where it moves them
+    gain: Float[Array, "n p m"]
+    at: Measured  # where it was linearised
+
+
+def owed(sensitivity: Float[Array, "d n p"], noise: Float[Array, "n p p"]) -> Float[Array, "d d"]:
+    """Covariance of what a state owes to the errors of the items."""
+    return _rows(jnp.einsum("dnp,npq->dnq", sensitivity, noise)) @ _rows(sensitivity).T
+
+
+def _rows(x: Float[Array, "d n p"]) -> Float[Array, "d np"]:
+    return x.reshape(x.shape[0], -1)
+
+
+def _times(F: Float[Array, "e d"], x: Float[Array, "d n p"]) -> Float[Array, "e n p"]:
+    return (F @ _rows(x)).reshape(-1, *x.shape[1:])
+
+
+def predict(model: Model[Mean], belief: Belief[Mean], dt: Float[Array, ""] | float = 1.0) -> Belief[Mean]:
+    """The belief one time step later."""
+    dt = jnp.asarray(dt, belief.own.dtype)
+    F = ekf.transition(model, belief.mean, dt)
+    own = F @ belief.own @ F.T + model.process_noise(belief.mean, dt)
+    return Belief(model.predict(belief.mean, dt), own, _times(F, belief.sensitivity))
+
+
+def total(model: Model[Mean], belief: Belief[Mean], items: PyTree[Array]) -> ekf.Belief[Mean]:
+    """The belief with the covariance of its whole error."""
+    return ekf.Belief(belief.mean, belief.covariance(model.item_noise(belief.mean, items)))
+
+
+class _Pass(NamedTuple):
+    """One linearisation; innovations are those of items that have not moved."""
+
+    at: Measured
+    item_noise: Float[Array, "n p p"]
+    innovation: Float[Array, "n m"]
+    whitener: Float[Array, "n m m"]  # of D = spread item_noise spread' + sigma^2
+    distance: Float[Array, " n"]
+    log_det: Float[Array, " n"]
+    noise: Float[Array, "n m m"]  # D
+
+    def whitened(self, root: Float[Array, " n"]) -> tuple[Float[Array, "r d"], Float[Array, " r"]]:
+        """Jacobian and innovation, r = n m, over the noise."""
+        H = jnp.einsum("n,nij,njd->nid", root, self.whitener, self.at.jacobian)
+        v = jnp.einsum("n,nij,nj->ni", root, self.whitener, self.innovation)
+        return H.reshape(-1, H.shape[-1]), v.reshape(-1)
+
+    def item_update(self, e: Float[Array, " d"]) -> ItemUpdate:
+        """Where the items belong, for a state that is off by e."""
+        inverse = jnp.einsum("nij,nik->njk", self.whitener, self.whitener)
+        gain = jnp.einsum("npq,nmq,nmk->npk", self.item_noise, self.at.spread, inverse)
+        left = self.innovation - jnp.einsum("nmd,d->nm", self.at.jacobian, e)
+        return ItemUpdate(jnp.einsum("npm,nm->np", gain, left), gain, self.at)
+
+
+def _linearise(
+    model: Model[Mean],
+    mean: Mean,
+    items: PyTree,
+    moved: Float[Array, "n p"],
+    item_noise: Float[Array, "n p p"],
+    observed: Float[Array, "n m"],
+    present: Bool[Array, " n"],
+) -> _Pass:
+    at = Measured(*ekf.replace_masked(present, model.measured(mean, items, moved), 0.0))
+    predicted, _, spread = at
+    innovation = observed - predicted + jnp.einsum("nmp,np->nm", spread, moved)
+    D = jnp.einsum("nmp,npq,nkq->nmk", spread, item_noise, spread)
+    D = D + jnp.square(model.sigma) * jnp.eye(observed.shape[1], dtype=D.dtype)
+    W, log_det = jax.vmap(ekf.whiten)(D)
+    distance = jnp.sum(jnp.einsum("nij,nj->ni", W, innovation) ** 2, axis=-1)
+    return _Pass(at, item_noise, innovation, W, distance, log_det, D)
+
+
+def update(
+    model: Model[Mean],
+    belief: Belief[Mean],
+    items: PyTree[Array],
+    observed: Float[Array, "n m"],
+    mask: Bool[Array, " n"],
+    *,
+    absorb: Bool[Array, " n"] | None = None,
+    passes: int = 4,
+    robust: Robust | None = None,
+) -> tuple[Belief[Mean], Diagnostics, ItemUpdate]:
+    """The belief after the measurements of one frame; arguments as of `jaxtri.ekf.update`.
+
+    `absorb` marks items whose measurement is about to enter their own estimate, as `ItemUpdate` says; those
+    that the robust gate leaves out are not absorbed. The belief comes back with the sensitivity to the errors
+    that they then have: what is new is the innovation s = spread m + v, and an item keeps m - gain s, which has
+    nothing in common with it. So no measurement is counted twice.
+
+    The passes before the last seek the point of linearisation and take the items' errors for new; the last
+    one's gain is Schmidt's.
+    """
+    dtype, d = belief.own.dtype, belief.own.shape[0]
+    present = mask if absorb is None else mask | absorb
+    item_noise = model.item_noise(belief.mean, items)
+    items, observed = ekf.stand_in(present, items), ekf.replace_masked(present, observed, 0.0)
+    valid = mask.astype(dtype)
+    still = jnp.zeros((mask.size, belief.sensitivity.shape[2]), dtype)
+    P = belief.covariance(item_noise)
+
+    def weigh(lin: _Pass, k: Array) -> Array:
+        return valid if robust is None else valid * robust.weights(lin.distance, k, passes)
+
+    def prior_at(mean: Mean) -> tuple[Array, Array]:
+        """The change to the errors of another mean, and the prior's centre in these."""
+        delta = model.local(belief.mean, mean)
+        reset = jax.jacfwd(lambda e: model.local(mean, model.retract(belief.mean, delta + e)))(jnp.zeros_like(delta))
+        return reset, -reset @ delta
+
+    def iterate(k: Array, carry: tuple[Mean, Array]) -> tuple[Mean, Array]:
+        mean, moved = carry
+        reset, centre = prior_at(mean)
+        lin = _linearise(model, mean, items, moved, item_noise, observed, present)
+        H, v = lin.whitened(ekf.safe_root(weigh(lin, k)))
+        e = centre + ekf.posterior_error(reset @ P @ reset.T, H.T @ H, H.T @ (v - H @ centre))
+        return model.retract(mean, e), lin.item_update(e).moved
+
+    mean, moved = jax.lax.fori_loop(0, passes - 1, iterate, (belief.mean, still))
+    reset, centre = prior_at(mean)
+    lin = _linearise(model, mean, items, moved, item_noise, observed, present)
+    weights, used = weigh(lin, jnp.asarray(passes - 1)), mask
+    if robust is not None:
+        used = mask & (lin.distance < robust.gate.astype(dtype))
+        weights = jnp.where(used, weights, 0.0)
+    root = ekf.safe_root(weights)
+    H, v = lin.whitened(root)
+    v = v - H @ centre
+    # S = D + G M G' with G = [H, spread C'], C = sensitivity noise, and M = [[P, I], [I, 0]]; O(d) by Woodbury.
+    cross = jnp.einsum("nmp,npq,dnq->nmd", lin.at.spread, item_noise, belief.sensitivity)
+    cross = jnp.einsum("n,nij,njd->nid", root, lin.whitener, cross).reshape(-1, d) @ reset.T
+    prior = reset @ P @ reset.T
+    variance = jnp.diagonal(prior)
+    s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
+    G = jnp.concatenate([H * s, cross / s], axis=1)
+    zero, eye = jnp.zeros((d, d), dtype), jnp.eye(d, dtype=dtype)
+    inner = jnp.block([[zero, eye], [eye, -prior / jnp.outer(s, s)]]) + G.T @ G
+    solved = jnp.linalg.solve(inner, jnp.concatenate([jnp.eye(2 * d, d, dtype=dtype), (G.T @ v)[:, None]], axis=1))
+    nis = v @ v - (G.T @ v) @ solved[:, -1]
+    # K of the whitened, then of the plain measurements.
+    gain = s[:, None] * (solved[:, :-1].T @ G.T)
+    e = centre + gain @ v
+    gain = jnp.einsum("dni,n,nij->dnj", gain.reshape(d, *observed.shape), root, lin.whitener)
+
+    # The error now lives at the new mean, close by.
+    final = model.retract(mean, e)
+    shift = jax.jacfwd(lambda x: model.local(final, model.retract(mean, e + x)))(jnp.zeros_like(e))
+    gain = _times(shift, gain)
+    keep = (shift - _rows(gain) @ lin.at.jacobian.reshape(-1, d)) @ reset
+    sensitivity = _times(keep, belief.sensitivity)
+    pulled = sensitivity - jnp.einsum("dnm,nmp->dnp", gain, lin.at.spread)
+    own = keep @ belief.own @ keep.T
+    of_items = lin.item_update(e)
+    fresh = jnp.square(model.sigma) * gain
+    if absorb is not None:
+        absorbed = absorb if robust is None else absorb & (lin.distance < robust.gate.astype(dtype))
+        new = jnp.einsum("dnp,npm->dnm", sensitivity, of_items.gain) - gain
+        fresh = jnp.where(absorbed[:, None], jnp.einsum("dnm,nmk->dnk", new, lin.noise), fresh)
+        gain = jnp.where(absorbed[:, None], new, gain)
+        pulled = jnp.where(absorbed[:, None], sensitivity, pulled)
+    own = own + _rows(fresh) @ _rows(gain).T
+    posterior = Belief(final, (own + own.T) / 2, pulled)
+
+    log_det = jnp.linalg.slogdet(inner)[1] + jnp.sum(jnp.where(used, lin.log_det, 0.0))
+    constant = observed.shape[1] * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
+    left = lin.innovation - jnp.einsum("nmd,d->nm", lin.at.jacobian, e)
+    diagnostics = Diagnostics(
+        log_likelihood=-(nis + log_det + constant) / 2,
+        nis=nis,
+        used=jnp.sum(used),
+        weights=weights,
+        distance=jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1),
+    )
+    return posterior, diagnostics, of_items
+
+
+def step(
+    model: Model[Mean],
+    belief: Belief[Mean],
+    items: PyTree[Array],
+    observed: Float[Array, "n m"],
+    mask: Bool[Array, " n"],
+    dt: Float[Array, ""] | float = 1.0,
+    *,
+    passes: int = 4,
+    robust: Robust | None = None,
+) -> tuple[Belief[Mean], Diagnostics]:
+    """Predict to the next frame and update with it."""
+    return update(model, predict(model, belief, dt), items, observed, mask, passes=passes, robust=robust)[:2]
+
+
+def filter(
+    model: Model[Mean],
+    belief: Belief[Mean],
+    items: PyTree[Array],
+    observed: Float[Array, "t n m"],
+    mask: Bool[Array, "t n"],
+    dt: Float[Array, " t"] | None = None,
+    *,
+    passes: int = 4,
+    robust: Robust | None = None,
+) -> tuple[ekf.Belief[Mean], Diagnostics]:
+    """Beliefs, with their whole covariance, and diagnostics of all frames: as `jaxtri.ekf.filter`."""
+    if dt is None:
+        dt = jnp.ones(observed.shape[0], belief.own.dtype)
+
+    # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.
+    @jax.checkpoint
+    def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
+        z, seen, elapsed = frame
+        carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
+        return carry, (total(model, carry, items), diagnostics)
+
+    return jax.lax.scan(body, belief, (observed, mask, dt))[1]
