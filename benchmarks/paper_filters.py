@@ -21,14 +21,14 @@ from jaxlie import SE3, SO3
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from jaxtri import ekf
+from jaxtri import ekf, schmidt
 from jaxtri.geometry.epipolar import homogeneous
 from jaxtri.geometry.trifocal import project
+from jaxtri.models import base_frames, two_step
 from jaxtri.models import structure_and_motion as sam
-from jaxtri.models import two_step
 from jaxtri.models.depth import Bank, Depth, scale_variance, triangulate
 from jaxtri.models.motion import Kinematics
-from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal, informative, start
+from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal, consistent_start, informative, start
 from jaxtri.synthetic.experiment import Experiment, paper_experiment
 from jaxtri.two_view import TwoView, refine
 
@@ -44,8 +44,11 @@ SD = Velocity(velocity_sd=0.01, angular_velocity_sd=0.02)  # of the velocity bet
 REST = Velocity(velocity_sd=0.02, angular_velocity_sd=0.03)  # of a camera of which nothing is known
 PLANE_SD = 0.5  # of the inverse depths of the classic start, relative
 AP_NOISE, TWO_STEP_NOISE = 100.0, 30.0  # the classic rows' noise over the true one
+BASES = (3, 8, 16, 28, 45, 70)  # the frames that become base frames, after the first two
 NAMES = {
     "default": "jaxtri, default",
+    "consistent": "jaxtri, `consistent` mode",
+    "bases8": "jaxtri, 8 base frames",
     "paper": "jaxtri, `paper` mode",
     "ap_classic": "A-P, classic start",
     "ap_good": "A-P, good start",
@@ -55,6 +58,8 @@ NAMES = {
 METHODS = tuple(NAMES)
 STYLES = {  # colour, line, marker
     "default": ("C0", "-", "*"),
+    "consistent": ("C4", "-", "s"),
+    "bases8": ("C3", "-", "D"),
     "paper": ("C0", "--", "x"),
     "ap_classic": ("C1", "--", "^"),
     "ap_good": ("C1", "-", "^"),
@@ -106,6 +111,10 @@ def plane_depth(view: TwoView, first: Float[Array, "n 2"], second: Float[Array, 
     return 1 / jnp.median(triangulate(view, first, second)[0])
 
 
+def _accelerations(e: Experiment) -> tuple[Array, Array]:
+    return jnp.asarray(ACCELERATION, e.sigma.dtype), jnp.asarray(ANGULAR_ACCELERATION, e.sigma.dtype)
+
+
 class Filter(NamedTuple):
     """A method at its start: what it carries, what it does with a frame, and what it then believes."""
 
@@ -115,9 +124,9 @@ class Filter(NamedTuple):
     observed: Float[Array, "t n 2"]  # the frames it is to see
 
 
-def run(e: Experiment, view: TwoView, method: str) -> Estimate:
-    """One trial, frames 2 to t-1."""
-    f = start_of(e, view, method)
+def run(e: Experiment, view: TwoView, method: str, frames: float = 1.0) -> Estimate:
+    """One trial, frames 2 to t-1; the first two are `frames` apart."""
+    f = start_of(e, view, method, frames)
 
     def body(carry: Any, z: Array) -> tuple[Any, Estimate]:
         carry = f.step(carry, z)
@@ -127,22 +136,29 @@ def run(e: Experiment, view: TwoView, method: str) -> Estimate:
     return _fitted(e, jax.tree.map(lambda x: x[1:], estimate)) if method.endswith("classic") else estimate
 
 
-def start_of(e: Experiment, view: TwoView, method: str) -> Filter:
-    """A method at the start of a trial. Those named `pose` do without the points: `pose`, `paper_pose`."""
+def start_of(e: Experiment, view: TwoView, method: str, frames: float = 1.0) -> Filter:
+    """A method at the start of a trial.
+
+    Those named `pose` do without the points: `pose`, `paper_pose`, `consistent_pose`; `bases8` has eight base
+    frames.
+    """
     if method.startswith("ap"):
-        return _full_covariance(e, view, method == "ap_good")
+        return _full_covariance(e, view, method == "ap_good", frames)
     if method.startswith("two_step"):
-        return _two_step(e, view, method == "two_step_good")
-    return _trifocal(e, view, method)
+        return _two_step(e, view, method == "two_step_good", frames)
+    if method.startswith("bases"):
+        return _base_frames(e, view, int(method.removeprefix("bases")), frames)
+    return _trifocal(e, view, method, frames)
 
 
-def _trifocal(e: Experiment, view: TwoView, method: str) -> Filter:
+def _trifocal(e: Experiment, view: TwoView, method: str, frames: float) -> Filter:
     """The pose by the transfer, then the points given the pose, frame by frame (the paper's figure 3)."""
     paper, structure = method.startswith("paper"), not method.endswith("pose")
+    consistent = method.startswith("consistent")
     mode = PAPER if paper else DEFAULT
     first, second = e.observed[0], e.observed[1]
-    belief = start(view, euler=mode.euler, **SD)
-    motion = jnp.asarray(ACCELERATION), jnp.asarray(ANGULAR_ACCELERATION), jnp.zeros(())
+    belief = start(view, frames=frames, euler=mode.euler, **SD)
+    motion = *_accelerations(e), jnp.zeros((), e.sigma.dtype)
     model = Trifocal(e.sigma, *motion, view.translation, mode.base_noise, mode.refine_base)
     pairs = jnp.concatenate([first, second], axis=-1)
     mask = informative(belief.mean, pairs, e.sigma, 10.0)
@@ -153,30 +169,60 @@ def _trifocal(e: Experiment, view: TwoView, method: str) -> Filter:
     moved: Kinematics = belief.mean.motion
     bank = depth.step(bank, moved.pose, second, everything, moved.pose_covariance(belief.covariance))
 
-    def step(carry: tuple[ekf.Belief, Bank | None], z: Array) -> tuple[ekf.Belief, Bank | None]:
+    def covariance(belief: ekf.Belief | schmidt.Belief) -> Array:
+        return belief.covariance if isinstance(belief, ekf.Belief) else schmidt.total(model, belief, pairs).covariance
+
+    def step(carry: tuple[Any, Bank | None], z: Array) -> tuple[Any, Bank | None]:
         belief, bank = carry
-        belief, _ = ekf.step(model, belief, pairs, z, mask, passes=mode.passes)
+        filter_ = schmidt if consistent else ekf
+        belief, _ = filter_.step(model, belief, pairs, z, mask, passes=mode.passes)
         if bank is None:
             return belief, None
-        pose, C = belief.mean.motion.pose, belief.mean.motion.pose_covariance(belief.covariance)
+        pose, C = belief.mean.motion.pose, belief.mean.motion.pose_covariance(covariance(belief))
         return belief, depth.step(bank, pose, z, everything, None if paper else C)
 
-    def read(carry: tuple[ekf.Belief, Bank]) -> Estimate:
+    def read(carry: tuple[Any, Bank]) -> Estimate:
         belief, bank = carry
         X, spread = depth.world(bank, scale)
         motion: Kinematics = belief.mean.motion
-        return Estimate(motion.R, motion.translation, motion.pose_covariance(belief.covariance), X, spread[:, 3, 3])
+        C = motion.pose_covariance(covariance(belief))
+        return Estimate(motion.R, motion.translation, C, X, spread[:, 3, 3])
 
-    return Filter((belief, bank if structure else None), step, read, e.observed[2:])
+    begun = consistent_start(view, pairs, everything, e.sigma, frames=frames, **SD) if consistent else belief
+    return Filter((begun, bank if structure else None), step, read, e.observed[2:])
 
 
-def _full_covariance(e: Experiment, view: TwoView, good: bool) -> Filter:
+def _base_frames(e: Experiment, view: TwoView, k: int, frames: float) -> Filter:
+    """K base frames, the first two and those of `BASES`; the points are the filter's own."""
+    model = base_frames.BaseFrames(e.sigma, *_accelerations(e))
+    everything = jnp.ones(e.observed.shape[1], bool)
+    belief = base_frames.start(view, e.observed[0], e.observed[1], everything, e.sigma, k, frames=frames, **SD)
+
+    def step(carry: tuple[schmidt.Belief, Array], z: Array) -> tuple[schmidt.Belief, Array]:
+        belief, t = carry
+        found = jnp.asarray(BASES) == t
+        base, slot = jnp.any(found) & (k > 2), 1 + jnp.argmax(found) % max(k - 2, 1)
+        return base_frames.step(model, belief, z, everything, base, slot, passes=DEFAULT.passes)[0], t + 1
+
+    def read(carry: tuple[schmidt.Belief, Array]) -> Estimate:
+        belief = carry[0]
+        motion, p = belief.mean.motion, belief.mean.points
+        P = schmidt.total(model, belief, None).covariance
+        lever = p.lever[:, 2]
+        variance = jnp.einsum("nb,bc,nc->n", lever, P[12:, 12:], lever) + jnp.square(e.sigma) * p.noise[:, 2, 2]
+        points = p.point / p.point[:, 2:3]
+        return Estimate(motion.R, motion.translation, motion.pose_covariance(P), points, variance)
+
+    return Filter((belief, jnp.asarray(2)), step, read, e.observed[2:])
+
+
+def _full_covariance(e: Experiment, view: TwoView, good: bool, frames: float) -> Filter:
     first, second = e.observed[0], e.observed[1]
-    motion = jnp.asarray(ACCELERATION), jnp.asarray(ANGULAR_ACCELERATION)
+    motion = _accelerations(e)
     model = sam.StructureAndMotion(e.sigma * (1.0 if good else AP_NOISE), *motion, ray_noise=good)
     items, everything = sam.sights(first), jnp.ones(len(first), bool)
     if good:
-        belief = sam.two_view_start(view, first, second, e.sigma, **SD)
+        belief = sam.two_view_start(view, first, second, e.sigma, frames=frames, **SD)
     else:
         z_init = plane_depth(view, first, second)
         nearest = jnp.argmin(jnp.abs(triangulate(view, first, second)[0] - 1 / z_init))
@@ -194,15 +240,15 @@ def _full_covariance(e: Experiment, view: TwoView, good: bool) -> Filter:
     return Filter(belief, step, read, e.observed[2 if good else 1 :])
 
 
-def _two_step(e: Experiment, view: TwoView, good: bool) -> Filter:
+def _two_step(e: Experiment, view: TwoView, good: bool, frames: float) -> Filter:
     first, second = e.observed[0], e.observed[1]
-    motion = jnp.asarray(ACCELERATION), jnp.asarray(ANGULAR_ACCELERATION)
+    motion = _accelerations(e)
     noise = e.sigma * (1.0 if good else TWO_STEP_NOISE)
     depth = Depth.of(noise) if good else Depth.paper(noise, inverse=True)
     model = two_step.TwoStep(two_step.KnownStructure(noise, *motion, structure_noise=good), depth)
     everything = jnp.ones(len(first), bool)
     if good:
-        belief = two_step.two_view_start(model, view, first, second, **SD)
+        belief = two_step.two_view_start(model, view, first, second, frames=frames, **SD)
     else:
         z_init = plane_depth(view, first, second)
         belief = two_step.planar_start(model, first, z_init, relative_sd=PLANE_SD, **REST)
