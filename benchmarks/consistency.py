@@ -37,7 +37,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from contract import parser, report, table
 from jaxlie import SO3
-from paper_filters import NAMES, STYLES, Trials, over_trials, run
+from paper_filters import NAMES, STYLES, Trials, over_trials, pose_errors, run
 from scipy.stats import chi2
 from tqdm import tqdm
 
@@ -102,11 +102,8 @@ def one(e: Experiment, view: TwoView, method: str, frames: float, single: bool) 
     if single:
         seen = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, seen)
     estimate = jax.tree.map(lambda x: x.astype(jnp.float64), run(seen[0], seen[1], method, frames))
-    R, T = e.rotations[2:], e.translations[2:]
-    between = jax.vmap(lambda a, b: SO3.from_matrix(a @ b.T).log())(R, estimate.R)
-    shift = T - estimate.T
-    error = jnp.concatenate([shift - jnp.cross(between, estimate.T), between], axis=-1)
-    nees = jnp.sum(error * jnp.linalg.solve(estimate.covariance, error[..., None])[..., 0], axis=-1)
+    between, shift, nees = pose_errors(e, estimate)
+    T = e.translations[2:]
     along = T / jnp.linalg.norm(T, axis=-1, keepdims=True)
     across = shift - along * jnp.sum(shift * along, axis=-1, keepdims=True)
     return {

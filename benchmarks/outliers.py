@@ -30,7 +30,7 @@ import numpy as np
 from contract import parser, report, table
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from paper_filters import ACCELERATION, ANGULAR_ACCELERATION, SD
+from paper_filters import ACCELERATION, ANGULAR_ACCELERATION, BASES, SD
 from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
@@ -65,7 +65,7 @@ CASES = {
 }
 LOST_DEG = 0.1
 FOCAL_PX = 600.0
-BASES = {3: 1, 8: 2, 16: 3, 28: 4, 45: 5, 70: 6}  # frames that become base frames, and their slots
+SLOTS = {frame: 1 + k for k, frame in enumerate(BASES)}  # of the frames that become base frames
 K = 8
 PASSES = 9
 SMALLEST_SNR = 10.0
@@ -157,15 +157,13 @@ def _bases(sigma: Array, motion: tuple[Array, Array], view: TwoView, u: Array, i
     model = base_frames.BaseFrames(sigma, *motion)
     begun = base_frames.start(view, u[0], u[1], inside, sigma, K, **SD)
     frames = np.arange(2, len(u))
-    base, slot = jnp.array([f in BASES for f in frames]), jnp.array([BASES.get(int(f), 0) for f in frames])
+    base, slot = jnp.array([f in SLOTS for f in frames]), jnp.array([SLOTS.get(int(f), 0) for f in frames])
 
     def step(belief: schmidt.Belief, frame: tuple[Array, Array, Array]) -> tuple[schmidt.Belief, Any]:
         z, base, slot = frame
         p = belief.mean.points
         mask = inside & (p.point[:, 3] > SMALLEST_SNR * sigma * jnp.sqrt(p.noise[:, 2, 2]))
-        belief, said = base_frames.step(
-            model, belief, z, mask, base, slot, passes=PASSES, robust=ekf.Robust()
-        )  # fmt: skip
+        belief, said = base_frames.step(model, belief, z, mask, base, slot, passes=PASSES, robust=ekf.Robust())
         return belief, (belief.mean.motion.R, mask, said)
 
     return jax.lax.scan(step, begun, (u[2:], base, slot))[1]

@@ -274,6 +274,24 @@ def _fitted(e: Experiment, estimate: Estimate) -> Estimate:
     return Estimate(estimate.R, s * T, estimate.covariance * jnp.outer(units, units), points, estimate.variance / s**2)
 
 
+class PoseErrors(NamedTuple):
+    """Errors of the poses of one trial, truth against estimate, a row per frame."""
+
+    turn: Float[Array, "t 3"]  # radians
+    shift: Float[Array, "t 3"]  # of the translation, metres
+    nees: Float[Array, " t"]
+
+
+def pose_errors(e: Experiment, estimate: Estimate) -> PoseErrors:
+    """How far the poses of frames 2 to t-1 are off, and for how far off they were taken."""
+    turn = jax.vmap(lambda a, b: SO3.from_matrix(a @ b.T).log())(e.rotations[2:], estimate.R)
+    shift = e.translations[2:] - estimate.T
+    error = jnp.concatenate([shift - jnp.cross(turn, estimate.T), turn], axis=-1)
+    return PoseErrors(
+        turn, shift, jnp.sum(error * jnp.linalg.solve(estimate.covariance, error[..., None])[..., 0], axis=-1)
+    )
+
+
 def reproject(points: Float[Array, "n 4"], R: Float[Array, "t 3 3"], T: Float[Array, "t 3"]) -> Float[Array, "t n 2"]:
     """Image points of homogeneous world points in all frames."""
     return jax.vmap(lambda R, T: jax.vmap(lambda X: project(X, R, T))(points))(R, T)

@@ -28,7 +28,7 @@ import numpy as np
 from contract import parser, report, table
 from jaxlie import SO3
 from matplotlib.axes import Axes
-from paper_filters import METHODS, NAMES, STYLES, Estimate, draw, over_trials, run
+from paper_filters import METHODS, NAMES, STYLES, Estimate, draw, over_trials, pose_errors, run
 
 jax.config.update("jax_enable_x64", True)
 
@@ -57,12 +57,9 @@ def errors(e: Experiment, estimate: Estimate) -> dict[str, jax.Array]:
     def turn(a: jax.Array) -> jax.Array:
         return SO3.from_matrix(a).log()
 
-    between = jax.vmap(lambda a, b: turn(a @ b.T))(R, estimate.R)
     angles = [jax.vmap(lambda x: jnp.linalg.norm(turn(x)))(x) for x in (R, estimate.R)]
     yaw, pitch, roll = (jax.vmap(euler_from_matrix)(R) - jax.vmap(euler_from_matrix)(estimate.R)).T
-    shift = T - estimate.T
-    error = jnp.concatenate([shift - jnp.cross(between, estimate.T), between], axis=-1)
-    nees = jnp.sum(error * jnp.linalg.solve(estimate.covariance, error[..., None])[..., 0], axis=-1)
+    between, shift, nees = pose_errors(e, estimate)
     degrees = {"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
     millimetres = {f"{axis}_mm": 1e3 * shift[:, k] for k, axis in enumerate(("tx", "ty", "tz"))}
     return {

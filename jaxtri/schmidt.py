@@ -61,7 +61,10 @@ class Model(ekf.Dynamics[Mean], Protocol[Mean]):
 
 
 class ItemUpdate(NamedTuple):
-    """What a frame says of the items, the state being as it is: least squares, item by item."""
+    """What a frame says of the items, the state being as it is: least squares, item by item.
+
+    As `update` returns it, zero but for the items that are absorbed.
+    """
 
     moved: Float[Array, "n p"]  # where it moves them
     gain: Float[Array, "n p m"]
@@ -218,11 +221,12 @@ def update(
     sensitivity = _times(keep, belief.sensitivity)
     pulled = sensitivity - jnp.einsum("dnm,nmp->dnp", gain, lin.at.spread)
     own = keep @ belief.own @ keep.T
-    of_items = lin.item_update(e)
+    said = lin.item_update(e)
+    absorbed = jnp.zeros_like(mask)
     fresh = jnp.square(model.sigma) * gain
     if absorb is not None:
         absorbed = absorb if robust is None else absorb & (lin.distance < robust.gate.astype(dtype))
-        new = jnp.einsum("dnp,npm->dnm", sensitivity, of_items.gain) - gain
+        new = jnp.einsum("dnp,npm->dnm", sensitivity, said.gain) - gain
         fresh = jnp.where(absorbed[:, None], jnp.einsum("dnm,nmk->dnk", new, lin.noise), fresh)
         gain = jnp.where(absorbed[:, None], new, gain)
         pulled = jnp.where(absorbed[:, None], sensitivity, pulled)
@@ -239,7 +243,8 @@ def update(
         weights=weights,
         distance=jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1),
     )
-    return posterior, diagnostics, of_items
+    moved, gain = ekf.replace_masked(absorbed, (said.moved, said.gain), 0.0)
+    return posterior, diagnostics, ItemUpdate(moved, gain, lin.at)
 
 
 def step(

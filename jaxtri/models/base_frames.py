@@ -191,12 +191,10 @@ def forget(model: BaseFrames, belief: Belief[BaseFramesState], gone: Bool[Array,
     return Belief(belief.mean, own, belief.sensitivity - S)
 
 
-def promote(
-    belief: Belief[BaseFramesState], slot: Int[Array, ""], absorbed: Bool[Array, " n"], said: schmidt.ItemUpdate
-) -> Belief[BaseFramesState]:
+def promote(belief: Belief[BaseFramesState], slot: Int[Array, ""], said: schmidt.ItemUpdate) -> Belief[BaseFramesState]:
     """The belief with the current pose as a base frame in `slot`, which must be empty.
 
-    `absorbed` marks the points whose measurement joins their estimate, as `said` by the update.
+    The points that the update has absorbed, as it `said`, are estimated anew.
     """
     mean, p = belief.mean, belief.mean.points
     pose, dtype = mean.motion.pose, belief.own.dtype
@@ -210,8 +208,7 @@ def promote(
         lever = (keep @ lever).at[:, at].add(-k @ A)
         return Points(point, basis, lever, keep @ Q @ keep.T + k @ k.T)
 
-    new = jax.vmap(one)(p.point, p.basis, p.lever, p.noise, said.moved, said.gain, said.at.spread)
-    points = jax.tree.map(lambda a, b: jnp.where(absorbed.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, p)
+    points = jax.vmap(one)(*p, said.moved, said.gain, said.at.spread)
     bases = jax.tree.map(lambda all_, x: all_.at[slot].set(x), mean.bases, pose)
     rows = 12 + at
     own = belief.own.at[rows].set(onto @ belief.own[:12])
@@ -275,10 +272,7 @@ def step(
     """
     predicted = schmidt.predict(model, belief, dt)
     ready = jax.lax.cond(base, lambda x: release(model, x, slot), lambda x: x, predicted)
-    absorb = mask & base
     updated, diagnostics, said = schmidt.update(
-        model, ready, None, observed, mask, absorb=absorb, passes=passes, robust=robust
+        model, ready, None, observed, mask, absorb=mask & base, passes=passes, robust=robust
     )
-    if robust is not None:
-        absorb &= diagnostics.weights > 0
-    return jax.lax.cond(base, lambda x: promote(x, slot, absorb, said), lambda x: x, updated), diagnostics
+    return jax.lax.cond(base, lambda x: promote(x, slot, said), lambda x: x, updated), diagnostics

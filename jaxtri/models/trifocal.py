@@ -20,7 +20,7 @@ from jaxtri.ekf import Belief
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
 from jaxtri.geometry.pose import local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
-from jaxtri.models.motion import Kinematics, acceleration_noise, from_two_view
+from jaxtri.models.motion import Kinematics, MotionStart, acceleration_noise, from_two_view
 from jaxtri.schmidt import Measured
 from jaxtri.two_view import TwoView, sensitivity
 
@@ -149,12 +149,11 @@ def start(
     correlated. The velocity is that between the two frames, with the given standard deviations (scene
     units and radians per frame). With `euler` rotations are the paper's yaw, pitch and roll.
     """
-    motion, C, lever, variance = from_two_view(
+    motion = from_two_view(
         two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd, euler=euler
     )
-    state = TrifocalState(motion, motion.translation, motion.rotation)
-    E = jnp.concatenate([lever, jnp.eye(6, dtype=lever.dtype)])
-    return Belief(state, E @ C @ E.T + jnp.diag(jnp.pad(variance, (0, 6))))
+    state, E, own = _with_base(motion)
+    return Belief(state, E @ motion.covariance @ E.T + own)
 
 
 def consistent_start(
@@ -171,13 +170,17 @@ def consistent_start(
 
     `mask` marks the pairs that the two-view estimate was made from, all of its data.
     """
-    motion, _, lever, variance = from_two_view(
-        two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd
-    )
-    state = TrifocalState(motion, motion.translation, motion.rotation)
-    E = jnp.concatenate([lever, jnp.eye(6, dtype=lever.dtype)])
+    motion = from_two_view(two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd)
+    state, E, own = _with_base(motion)
     S = sensitivity(two_view, pairs[:, :2], pairs[:, 2:], mask, sigma)
-    return schmidt.Belief(state, jnp.diag(jnp.pad(variance, (0, 6))), jnp.einsum("de,nep->dnp", E, S))
+    return schmidt.Belief(state, own, jnp.einsum("de,nep->dnp", E, S))
+
+
+def _with_base(start: MotionStart) -> tuple[TrifocalState, Float[Array, "18 6"], Float[Array, "18 18"]]:
+    """The state at the second base frame, what its error owes to that of the estimate, and the rest's covariance."""
+    motion = start.motion
+    E = jnp.concatenate([start.lever, jnp.eye(6, dtype=start.lever.dtype)])
+    return TrifocalState(motion, motion.translation, motion.rotation), E, jnp.diag(jnp.pad(start.variance, (0, 6)))
 
 
 def informative(
