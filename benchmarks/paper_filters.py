@@ -208,7 +208,7 @@ def _base_frames(e: Experiment, view: TwoView, k: int, frames: float) -> Filter:
         belief = carry[0]
         motion, p = belief.mean.motion, belief.mean.points
         P = schmidt.total(model, belief, None).covariance
-        lever = p.lever[:, 2]
+        lever = p.owed[:, 2]
         variance = jnp.einsum("nb,bc,nc->n", lever, P[12:, 12:], lever) + jnp.square(e.sigma) * p.noise[:, 2, 2]
         points = p.point / p.point[:, 2:3]
         return Estimate(motion.R, motion.translation, motion.pose_covariance(P), points, variance)

@@ -132,7 +132,7 @@ def test_releasing_a_base_frame_leaves_the_pose_alone(based):
     # Nothing becomes more certain: the whole covariance of each point.
     whole = []
     for b, C in ((belief, before), (free, after)):
-        lever = np.asarray(b.mean.points.lever)
+        lever = np.asarray(b.mean.points.owed)
         whole.append(lever @ C[12:, 12:] @ np.swapaxes(lever, 1, 2) + model.sigma**2 * b.mean.points.noise)
     assert np.linalg.eigvalsh(whole[1] - whole[0]).min() > -1e-6 * np.abs(whole[0]).max()
 
@@ -158,19 +158,34 @@ def test_a_new_point_stands_where_it_was_seen_and_moves_with_its_base_frame(base
     model, belief, e = based
     fresh = jnp.arange(N) < 3
     z = e.observed[-1]
-    new = jax.jit(base_frames.begin)(model, belief, jnp.asarray(2), z, fresh, jnp.asarray(2.0))
+    new = jax.jit(base_frames.begin)(model, belief, jnp.asarray(2), z, fresh, jnp.asarray(2.0), jnp.asarray(1.0))
     assert not np.any(new.sensitivity[:, :3])
     pose, p = new.mean.motion.pose, new.mean.points
-    seen = jax.vmap(lambda X: base_frames._derivatives(pose, X, p.basis[0])[0])(p.point[:3])
+    seen = jax.vmap(lambda X: base_frames._derivatives(pose, X)[0])(p.point[:3])
     np.testing.assert_allclose(seen, z[:3], atol=1e-12)
     # Move the base frame and the points with it: from there they look the same, and as deep.
     error = 1e-5 * jax.random.normal(jax.random.key(0), (6,))
-    X = p.point[:3] + jnp.einsum("nij,njk,k->ni", p.basis[:3], p.lever[:3, :, 12:18], error)
+    X = p.point[:3] + p.lever[:3, :, 12:18] @ error
     there = retract(pose, error)
     x = X[:, :3] @ there.rotation().as_matrix().T + X[:, 3:] * there.translation()
     np.testing.assert_allclose(x[:, :2] / x[:, 2:], z[:3], atol=1e-8)
     np.testing.assert_allclose(X[:, 3] / x[:, 2], 2.0, atol=1e-8)
     np.testing.assert_array_equal(p.point[3:], belief.mean.points.point[3:])
+    # Twice as near, its lever is the one that the slope leads to.
+    near = jax.jit(base_frames.begin)(model, belief, jnp.asarray(2), z, fresh, jnp.asarray(4.0), jnp.asarray(1.0))
+    np.testing.assert_allclose(near.mean.points.lever[:3], p.lever[:3] + 2 * p.slope[:3], atol=1e-12)
+
+
+def test_the_lever_of_a_pair_is_that_of_the_point_as_it_moves():
+    e, view = begin(jax.random.key(2))
+    first, second, everything = e.observed[0], e.observed[1], jnp.ones(N, bool)
+    along = view.translation[:2] - second * view.translation[2]
+    start = jax.jit(lambda z: base_frames.start(view, first, z, everything, e.sigma, 3, **SD).mean.points)
+    here, there = start(second), start(second + 1e-3 * along)
+    moved = (there.point - here.point)[:, 3, None, None]
+    change = there.lever - here.lever
+    assert np.abs(change).max() > 1e-3
+    np.testing.assert_allclose(change, here.slope * moved, atol=0.02 * np.abs(change).max())
 
 
 def test_measured_derivatives(based):

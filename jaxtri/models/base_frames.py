@@ -2,8 +2,10 @@
 
 The trifocal filter knows a point from a pair of base frames. Here the pair's point goes on: whatever frame is
 made a base frame adds its observation to the point by least squares, given the base poses, which are in the
-state. The structure itself is not: a point is a linear function of the errors of the base poses (`lever`) and
-an error of its own, which `jaxtri.schmidt` considers. So a frame costs O(N), no information of a base frame is
+state. The structure itself is not: a point moves with the errors of the base poses (`lever`) and has
+an error of its own, which `jaxtri.schmidt` considers. A lever is that of the point as the current frame
+corrects it (`slope`): taken where a noisy point stands it has an error in common with the innovation, which
+adds up to a drift of the scale. So a frame costs O(N), no information of a base frame is
 lost and none is counted twice. With the pair alone it is the trifocal filter, to first order.
 
 A point may begin in any base frame, with a prior on its inverse depth. A base frame that makes room for
@@ -33,8 +35,15 @@ class Points(NamedTuple):
 
     point: Float[Array, "n 4"]
     basis: Float[Array, "n 4 3"]  # where an error takes it: image point and inverse depth, where it was first seen
-    lever: Float[Array, "n 3 b"]  # what its error owes to those of the base poses
-    noise: Float[Array, "n 3 3"]  # covariance of the rest, in units of sigma^2
+    lever: Float[Array, "n 4 b"]  # where the errors of the base poses take it
+    slope: Float[Array, "n 4 b"]  # of the lever, as the inverse depth changes
+    noise: Float[Array, "n 3 3"]  # covariance of the errors, in units of sigma^2
+
+    @property
+    def owed(self) -> Float[Array, "n 3 b"]:
+        """What a point owes to the errors of the base poses, as an error of its own."""
+        # Homogeneous: what only makes the point longer is none.
+        return jnp.linalg.solve(jnp.concatenate([self.basis, self.point[:, :, None]], axis=2), self.lever)[:, :3]
 
 
 class BaseFramesState(eqx.Module):
@@ -56,7 +65,7 @@ class BaseFrames(eqx.Module):
         """The state moved by an error, the points with their base frames."""
         bases = jax.vmap(retract)(mean.bases, delta[12:].reshape(-1, 6))
         p = mean.points
-        point = p.point + jnp.einsum("nij,njb,b->ni", p.basis, p.lever, delta[12:])
+        point = p.point + p.lever @ delta[12:]
         return BaseFramesState(retract(mean.motion, delta[:12]), bases, p._replace(point=point))
 
     def local(self, mean: BaseFramesState, other: BaseFramesState) -> Float[Array, " d"]:
@@ -80,11 +89,11 @@ class BaseFrames(eqx.Module):
         # The error of the pose, as a left perturbation, owes to that of the motion alone.
         onto = jax.jacfwd(lambda e: local(pose, retract(motion, e).pose))(jnp.zeros(12, p.point.dtype))
 
-        def one(point: Array, basis: Array, lever: Array, m: Array) -> tuple[Array, Array, Array]:
-            y, A, B = _derivatives(pose, point + basis @ m, basis)
-            return y, jnp.concatenate([A @ onto, B @ lever], axis=1), B
+        def one(p: Points, m: Array) -> tuple[Array, Array, Array]:
+            y, A, B = _derivatives(pose, p.point + p.basis @ m)
+            return y, jnp.concatenate([A @ onto, B @ (p.lever + p.slope * m[2])], axis=1), B @ p.basis
 
-        y, H, B = jax.vmap(one)(p.point, p.basis, p.lever, moved)
+        y, H, B = jax.vmap(one)(p, moved)
         return Measured(y, H, B)
 
     def item_noise(self, mean: BaseFramesState, items: None) -> Float[Array, "n 3 3"]:
@@ -92,15 +101,13 @@ class BaseFrames(eqx.Module):
         return jnp.square(self.sigma) * mean.points.noise
 
 
-def _derivatives(
-    pose: SE3, X: Float[Array, "4"], basis: Float[Array, "4 3"]
-) -> tuple[Float[Array, "2"], Float[Array, "2 6"], Float[Array, "2 3"]]:
-    """Image point, and its derivatives with respect to a left perturbation of the pose and an error of the point."""
+def _derivatives(pose: SE3, X: Float[Array, "4"]) -> tuple[Float[Array, "2"], Float[Array, "2 6"], Float[Array, "2 4"]]:
+    """Image point, and its derivatives with respect to a left perturbation of the pose and to the point."""
     R, T, eye = pose.rotation().as_matrix(), pose.translation(), jnp.eye(3, dtype=X.dtype)
     x = R @ X[:3] + X[3] * T
     J = jax.jacfwd(dehomogenise)(x)
     A = jnp.concatenate([X[3] * eye, jnp.cross(eye, x).T], axis=1)
-    return dehomogenise(x), J @ A, J @ (R @ basis[:3] + jnp.outer(T, basis[3]))
+    return dehomogenise(x), J @ A, J @ jnp.concatenate([R, T[:, None]], axis=1)
 
 
 def start(
@@ -119,7 +126,7 @@ def start(
 
     `mask` marks the pairs that it was made from. The points are those of the transfer (Yu et al. 2006, eqs 7-9).
     """
-    motion, _, lever, variance = from_two_view(
+    motion, _, of_motion, variance = from_two_view(
         two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd
     )
     pose, dtype, n, b = motion.pose, first.dtype, len(first), 6 * (k - 1)
@@ -131,15 +138,21 @@ def start(
         T = two.translation()
         return inverse_depth(pair[:2], pair[2:], two.rotation().as_matrix(), T, T)
 
-    value, (by_pair, by_pose) = jax.vmap(jax.value_and_grad(depth, (0, 1)), (0, None))(pairs, jnp.zeros(6, dtype))
+    zero = jnp.zeros(6, dtype)
+    value, by_pair = jax.vmap(jax.value_and_grad(depth), (0, None))(pairs, zero)
+    # The point goes along its first ray as its second observation moves.
+    seen = by_pair.at[:, :2].set(0.0)
+    onward = seen / jnp.maximum(jnp.sum(seen**2, axis=1, keepdims=True), jnp.finfo(dtype).tiny)
+    of_pose = jax.vmap(lambda x, dx: jax.jvp(lambda x: jax.grad(depth, 1)(x, zero), (x,), (dx,)))(pairs, onward)
     point = jnp.concatenate([pairs[:, :2], jnp.ones((n, 1), dtype), value[:, None]], axis=1)
     M = jnp.broadcast_to(jnp.eye(3, 4, dtype=dtype), (n, 3, 4)).at[:, 2].set(by_pair)
     Q = M @ M.mT
     basis = jnp.eye(4, dtype=dtype)[:, jnp.array([0, 1, 3])]
-    points = Points(point, jnp.broadcast_to(basis, (n, 4, 3)), jnp.zeros((n, 3, b), dtype).at[:, 2, :6].set(by_pose), Q)
+    lever, slope = (jnp.zeros((n, 4, b), dtype).at[:, 3, :6].set(x) for x in of_pose)
+    points = Points(point, jnp.broadcast_to(basis, (n, 4, 3)), lever, slope, Q)
     bases = jax.tree.map(lambda x: jnp.broadcast_to(x, (k - 1, *x.shape)), pose)
     # What the estimate owes to the pairs: by way of the points' errors, and the rest.
-    onto = jnp.zeros((12 + b, 6), dtype).at[:12].set(lever).at[12:18].set(shear(pose.translation()))
+    onto = jnp.zeros((12 + b, 6), dtype).at[:12].set(of_motion).at[12:18].set(shear(pose.translation()))
     S = jnp.einsum("de,nep->dnp", onto, sensitivity(two_view, first, second, mask, sigma))
     by_points = jnp.einsum("dnp,niq,nqp->dni", S, jnp.linalg.inv(Q), M)
     rest = (S - jnp.einsum("dni,nip->dnp", by_points, M)).reshape(12 + b, -1)
@@ -169,13 +182,13 @@ def release(model: BaseFrames, belief: Belief[BaseFramesState], slot: Int[Array,
     Phi = jnp.where(variance[at, None] > 0, s[at, None] * Phi / s * others, 0.0)
     remainder = jnp.eye(b, dtype=dtype)[at] - Phi
     left = remainder @ P @ remainder.T
-    onto = p.lever[:, :, at]
+    onto = p.owed[:, :, at]
     more = onto @ left @ onto.mT
     T = jnp.linalg.solve(Q + more, Q).mT
     keep = jnp.eye(3, dtype=dtype) - T
     lost = keep @ Q @ keep.mT + T @ more @ T.mT
-    lever = (p.lever * others) + onto @ Phi
-    points = p._replace(lever=lever, noise=p.noise + more / jnp.square(model.sigma))
+    lever, slope = (x * others + x[:, :, at] @ Phi for x in (p.lever, p.slope))
+    points = p._replace(lever=lever, slope=slope, noise=p.noise + more / jnp.square(model.sigma))
     own = belief.own + schmidt.owed(belief.sensitivity, lost)
     kept = jnp.concatenate([jnp.ones(12, dtype), others])
     mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
@@ -201,14 +214,19 @@ def promote(belief: Belief[BaseFramesState], slot: Int[Array, ""], said: schmidt
     at = 6 * slot + jnp.arange(6)
     onto = jax.jacfwd(lambda e: local(pose, retract(mean.motion, e).pose))(jnp.zeros(12, dtype))
 
-    def one(point: Array, basis: Array, lever: Array, Q: Array, moved: Array, k: Array, B: Array) -> Points:
-        point = point + basis @ moved
-        _, A, _ = _derivatives(pose, point, basis)
-        keep = jnp.eye(3, dtype=dtype) - k @ B
-        lever = (keep @ lever).at[:, at].add(-k @ A)
-        return Points(point, basis, lever, keep @ Q @ keep.T + k @ k.T)
+    def one(p: Points, moved: Array, k: Array, B: Array) -> Points:
+        def lever(further: Array) -> Array:
+            m = moved.at[2].add(further)
+            _, A, B = _derivatives(pose, p.point + p.basis @ m)
+            old = p.lever + p.slope * m[2]
+            return old - p.basis @ k @ (B @ old).at[:, at].add(A)
 
-    points = jax.vmap(one)(*p, said.moved, said.gain, said.at.spread)
+        keep = jnp.eye(3, dtype=dtype) - k @ B
+        zero = jnp.zeros((), dtype)
+        value, slope = jax.jvp(lever, (zero,), (jnp.ones_like(zero),))
+        return Points(p.point + p.basis @ moved, p.basis, value, slope, keep @ p.noise @ keep.T + k @ k.T)
+
+    points = jax.vmap(one)(p, said.moved, said.gain, said.at.spread)
     bases = jax.tree.map(lambda all_, x: all_.at[slot].set(x), mean.bases, pose)
     rows = 12 + at
     own = belief.own.at[rows].set(onto @ belief.own[:12])
@@ -224,31 +242,34 @@ def begin(
     observed: Float[Array, "n 2"],
     fresh: Bool[Array, " n"],
     inverse_depth: Float[Array, ""],
+    sd: Float[Array, ""],
 ) -> Belief[BaseFramesState]:
     """The belief with new points, first seen from the base frame in `slot`, the current pose.
 
-    Their inverse depth is the given one, give or take as much. The state owes nothing to them yet; points that
-    they replace are to be forgotten first.
+    Their inverse depth is the given one, with the standard deviation `sd`: a narrow one, wrong for all points
+    alike, would tell on the scale. The state owes nothing to them yet; points that they replace are to be
+    forgotten first.
     """
     pose, p, dtype = belief.mean.motion.pose, belief.mean.points, belief.own.dtype
     R, T, eye = pose.rotation().as_matrix(), pose.translation(), jnp.eye(3, dtype=dtype)
     at = 6 * slot + jnp.arange(6)
-    noise = jnp.diag(jnp.stack([jnp.ones((), dtype), jnp.ones((), dtype), jnp.square(inverse_depth / model.sigma)]))
+    one = jnp.ones((), dtype)
+    noise = jnp.diag(jnp.stack([one, one, jnp.square(sd / model.sigma)]))
     # From (u, 1, inverse depth) in the camera to the world.
-    back = jnp.block([[R.T, -(R.T @ T)[:, None]], [jnp.zeros((1, 3), dtype), jnp.ones((1, 1), dtype)]])
+    back = jnp.block([[R.T, -(R.T @ T)[:, None]], [jnp.zeros((1, 3), dtype), one[None, None]]])
 
-    def one(u: Float[Array, "2"]) -> tuple[Array, Array]:
+    def seen(u: Float[Array, "2"]) -> tuple[Array, Array]:
         x = homogeneous(u)
-        # A perturbed pose takes x elsewhere; then its last component is made one again.
-        turned = jnp.concatenate([inverse_depth * eye, jnp.cross(eye, x).T], axis=1)
-        image = jnp.concatenate([turned[:2] - jnp.outer(u, turned[2]), -inverse_depth * turned[2:]])
-        return back @ jnp.append(x, inverse_depth), -image
+        return back @ jnp.append(x, inverse_depth), jnp.concatenate([inverse_depth * eye, jnp.cross(eye, x).T], axis=1)
 
-    point, lever = jax.vmap(one)(observed)
-    basis = jnp.broadcast_to(back[:, jnp.array([0, 1, 3])], p.basis.shape)
-    b = p.lever.shape[2]
-    lever = jnp.zeros((len(observed), 3, b), dtype).at[:, :, at].set(lever)
-    new = Points(point, basis, lever, jnp.broadcast_to(noise, p.noise.shape))
+    point, turned = jax.vmap(seen)(observed)
+    new = Points(
+        point,
+        jnp.broadcast_to(back[:, jnp.array([0, 1, 3])], p.basis.shape),
+        jnp.zeros_like(p.lever).at[:, :, at].set(-back[:, :3] @ turned),
+        jnp.zeros_like(p.slope).at[:, :, at[:3]].set(-back[:, :3]),
+        jnp.broadcast_to(noise, p.noise.shape),
+    )
     points = jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, p)
     mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
     return Belief(mean, belief.own, jnp.where(fresh[:, None], 0.0, belief.sensitivity))
