@@ -42,6 +42,7 @@ class Velocity(TypedDict):
 
 SD = Velocity(velocity_sd=0.01, angular_velocity_sd=0.02)  # of the velocity between the first two frames
 REST = Velocity(velocity_sd=0.02, angular_velocity_sd=0.03)  # of a camera of which nothing is known
+SMALLEST_SNR = 10.0  # of the inverse depth of a pair
 PLANE_SD = 0.5  # of the inverse depths of the classic start, relative
 AP_NOISE, TWO_STEP_NOISE = 100.0, 30.0  # the classic rows' noise over the true one
 BASES = (3, 8, 16, 28, 45, 70)  # the frames that become base frames, after the first two
@@ -76,6 +77,7 @@ class Estimate(NamedTuple):
     covariance: Float[Array, "t 6 6"]  # of the left perturbation (linear, angular)
     points: Float[Array, "t n 4"]  # homogeneous, in the first camera, the world
     variance: Float[Array, "t n"]  # of the last component, the inverse depth, the scale's included
+    nis: Float[Array, " t"]  # normalised innovation squared, per component measured
 
 
 class Trials(NamedTuple):
@@ -119,8 +121,8 @@ class Filter(NamedTuple):
     """A method at its start: what it carries, what it does with a frame, and what it then believes."""
 
     carry: Any
-    step: Callable[[Any, Float[Array, "n 2"]], Any]
-    read: Callable[[Any], Estimate]
+    step: Callable[[Any, Float[Array, "n 2"]], tuple[Any, ekf.Diagnostics]]
+    read: Callable[[Any, Float[Array, ""]], Estimate]  # given the NIS of the step
     observed: Float[Array, "t n 2"]  # the frames it is to see
 
 
@@ -129,8 +131,8 @@ def run(e: Experiment, view: TwoView, method: str, frames: float = 1.0) -> Estim
     f = start_of(e, view, method, frames)
 
     def body(carry: Any, z: Array) -> tuple[Any, Estimate]:
-        carry = f.step(carry, z)
-        return carry, f.read(carry)
+        carry, said = f.step(carry, z)
+        return carry, f.read(carry, said.nis / (2 * said.used))
 
     estimate = jax.lax.scan(body, f.carry, f.observed)[1]
     return _fitted(e, jax.tree.map(lambda x: x[1:], estimate)) if method.endswith("classic") else estimate
@@ -161,7 +163,7 @@ def _trifocal(e: Experiment, view: TwoView, method: str, frames: float) -> Filte
     motion = *_accelerations(e), jnp.zeros((), e.sigma.dtype)
     model = Trifocal(e.sigma, *motion, view.translation, mode.base_noise, mode.refine_base)
     pairs = jnp.concatenate([first, second], axis=-1)
-    mask = informative(belief.mean, pairs, e.sigma, 10.0)
+    mask = informative(belief.mean, pairs, e.sigma, SMALLEST_SNR)
     depth = Depth.paper(e.sigma, inverse=True) if paper else Depth.of(e.sigma)
     scale = scale_variance(view, first, second, mask, e.sigma)
     everything = jnp.ones(len(first), bool)
@@ -172,21 +174,21 @@ def _trifocal(e: Experiment, view: TwoView, method: str, frames: float) -> Filte
     def covariance(belief: ekf.Belief | schmidt.Belief) -> Array:
         return belief.covariance if isinstance(belief, ekf.Belief) else schmidt.total(model, belief, pairs).covariance
 
-    def step(carry: tuple[Any, Bank | None], z: Array) -> tuple[Any, Bank | None]:
+    def step(carry: tuple[Any, Bank | None], z: Array) -> tuple[tuple[Any, Bank | None], ekf.Diagnostics]:
         belief, bank = carry
         filter_ = schmidt if consistent else ekf
-        belief, _ = filter_.step(model, belief, pairs, z, mask, passes=mode.passes)
+        belief, said = filter_.step(model, belief, pairs, z, mask, passes=mode.passes)
         if bank is None:
-            return belief, None
+            return (belief, None), said
         pose, C = belief.mean.motion.pose, belief.mean.motion.pose_covariance(covariance(belief))
-        return belief, depth.step(bank, pose, z, everything, None if paper else C)
+        return (belief, depth.step(bank, pose, z, everything, None if paper else C)), said
 
-    def read(carry: tuple[Any, Bank]) -> Estimate:
+    def read(carry: tuple[Any, Bank], nis: Array) -> Estimate:
         belief, bank = carry
         X, spread = depth.world(bank, scale)
         motion: Kinematics = belief.mean.motion
         C = motion.pose_covariance(covariance(belief))
-        return Estimate(motion.R, motion.translation, C, X, spread[:, 3, 3])
+        return Estimate(motion.R, motion.translation, C, X, spread[:, 3, 3], nis)
 
     begun = consistent_start(view, pairs, everything, e.sigma, frames=frames, **SD) if consistent else belief
     return Filter((begun, bank if structure else None), step, read, e.observed[2:])
@@ -198,20 +200,22 @@ def _base_frames(e: Experiment, view: TwoView, k: int, frames: float) -> Filter:
     everything = jnp.ones(e.observed.shape[1], bool)
     belief = base_frames.start(view, e.observed[0], e.observed[1], everything, e.sigma, k, frames=frames, **SD)
 
-    def step(carry: tuple[schmidt.Belief, Array], z: Array) -> tuple[schmidt.Belief, Array]:
+    def step(carry: tuple[schmidt.Belief, Array], z: Array) -> tuple[tuple[schmidt.Belief, Array], ekf.Diagnostics]:
         belief, t = carry
         found = jnp.asarray(BASES) == t
         base, slot = jnp.any(found) & (k > 2), 1 + jnp.argmax(found) % max(k - 2, 1)
-        return base_frames.step(model, belief, z, everything, base, slot, passes=DEFAULT.passes)[0], t + 1
+        mask = base_frames.informative(model, belief, SMALLEST_SNR)
+        belief, said = base_frames.step(model, belief, z, mask, base, slot, passes=DEFAULT.passes)
+        return (belief, t + 1), said
 
-    def read(carry: tuple[schmidt.Belief, Array]) -> Estimate:
+    def read(carry: tuple[schmidt.Belief, Array], nis: Array) -> Estimate:
         belief = carry[0]
         motion, p = belief.mean.motion, belief.mean.points
         P = schmidt.total(model, belief, None).covariance
         lever = p.owed[:, 2]
         variance = jnp.einsum("nb,bc,nc->n", lever, P[12:, 12:], lever) + jnp.square(e.sigma) * p.noise[:, 2, 2]
         points = p.point / p.point[:, 2:3]
-        return Estimate(motion.R, motion.translation, motion.pose_covariance(P), points, variance)
+        return Estimate(motion.R, motion.translation, motion.pose_covariance(P), points, variance, nis)
 
     return Filter((belief, jnp.asarray(2)), step, read, e.observed[2:])
 
@@ -228,14 +232,14 @@ def _full_covariance(e: Experiment, view: TwoView, good: bool, frames: float) ->
         nearest = jnp.argmin(jnp.abs(triangulate(view, first, second)[0] - 1 / z_init))
         belief = sam.planar_start(first, z_init, relative_sd=PLANE_SD, reference=nearest, **REST)
 
-    def step(belief: ekf.Belief, z: Array) -> ekf.Belief:
-        return ekf.step(model, belief, items, z, everything, passes=4 if good else 1)[0]
+    def step(belief: ekf.Belief, z: Array) -> tuple[ekf.Belief, ekf.Diagnostics]:
+        return ekf.step(model, belief, items, z, everything, passes=4 if good else 1)
 
-    def read(belief: ekf.Belief) -> Estimate:
+    def read(belief: ekf.Belief, nis: Array) -> Estimate:
         motion, inverse = belief.mean.motion, belief.mean.parameters
         X = jnp.concatenate([homogeneous(first), inverse[:, None]], axis=-1)
         variance = jnp.diagonal(belief.covariance)[12:]
-        return Estimate(motion.R, motion.translation, motion.pose_covariance(belief.covariance), X, variance)
+        return Estimate(motion.R, motion.translation, motion.pose_covariance(belief.covariance), X, variance, nis)
 
     return Filter(belief, step, read, e.observed[2 if good else 1 :])
 
@@ -253,14 +257,14 @@ def _two_step(e: Experiment, view: TwoView, good: bool, frames: float) -> Filter
         z_init = plane_depth(view, first, second)
         belief = two_step.planar_start(model, first, z_init, relative_sd=PLANE_SD, **REST)
 
-    def step(belief: two_step.TwoStepBelief, z: Array) -> two_step.TwoStepBelief:
-        return two_step.step(model, belief, z, everything, passes=4 if good else 1)[0]
+    def step(belief: two_step.TwoStepBelief, z: Array) -> tuple[two_step.TwoStepBelief, ekf.Diagnostics]:
+        return two_step.step(model, belief, z, everything, passes=4 if good else 1)
 
-    def read(belief: two_step.TwoStepBelief) -> Estimate:
+    def read(belief: two_step.TwoStepBelief, nis: Array) -> Estimate:
         motion: Kinematics = belief.camera.mean
         X, spread = depth.world(belief.bank)
         C = motion.pose_covariance(belief.camera.covariance)
-        return Estimate(motion.R, motion.translation, C, X, spread[:, 3, 3])
+        return Estimate(motion.R, motion.translation, C, X, spread[:, 3, 3], nis)
 
     return Filter(belief, step, read, e.observed[2 if good else 1 :])
 
@@ -271,7 +275,12 @@ def _fitted(e: Experiment, estimate: Estimate) -> Estimate:
     s = jnp.sum(e.translations[2:] * T) / jnp.sum(T * T)
     units = jnp.repeat(jnp.stack([s, jnp.ones_like(s)]), 3)
     points = estimate.points.at[..., 3].divide(s)
-    return Estimate(estimate.R, s * T, estimate.covariance * jnp.outer(units, units), points, estimate.variance / s**2)
+    return estimate._replace(
+        T=s * T,
+        covariance=estimate.covariance * jnp.outer(units, units),
+        points=points,
+        variance=estimate.variance / s**2,
+    )
 
 
 class PoseErrors(NamedTuple):

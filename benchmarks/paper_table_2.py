@@ -54,7 +54,7 @@ class Clock:
         f = start_of(e, view, method)
 
         def advance(carry: object, observed: Array) -> object:
-            return jax.lax.scan(lambda c, z: (f.step(c, z), None), carry, observed)[0]
+            return jax.lax.scan(lambda c, z: (f.step(c, z)[0], None), carry, observed)[0]
 
         self.observed, self.seen = f.observed, 0
         self.run = jax.jit(advance)

@@ -156,8 +156,7 @@ def outputs(run: Run, view: TwoView, mode: str, weights: ekf.Robust | None) -> t
 
         def step(belief: schmidt.Belief, frame: tuple[Array, Array, Array, Array]) -> tuple[schmidt.Belief, Any]:
             z, seen, base, slot = frame
-            p = belief.mean.points
-            sure = p.point[:, 3] > SMALLEST_SNR * run.sigma * jnp.sqrt(p.noise[:, 2, 2])
+            sure = base_frames.informative(model, belief, SMALLEST_SNR)
             belief, said = base_frames.step(model, belief, z, seen & sure, base, slot, passes=passes, robust=weights)
             return belief, (belief.mean.motion, belief.mean.bases, schmidt.total(model, belief, None).covariance, said)
 

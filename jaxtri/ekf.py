@@ -72,10 +72,10 @@ class Robust(eqx.Module):
     convex problem; m2 is the squared Mahalanobis distance under the measurement noise, not under the
     prediction: gating against the prediction throws good points away whenever the motion changes. `gate`
     is the m2 above which an item is left out in the end; 13.8 is the 99.9 % quantile of 2 components. A
-    higher `start` survives a worse prediction and needs more passes: 1e4 nine, 1e7 about sixteen.
+    higher `start` survives a worse prediction and needs more passes: 1e5 nine, 1e7 about sixteen.
     """
 
-    start: Float[Array, ""] = eqx.field(default=1e4, converter=_number)
+    start: Float[Array, ""] = eqx.field(default=1e5, converter=_number)
     scale: Float[Array, ""] = eqx.field(default=16.0, converter=_number)
     gate: Float[Array, ""] = eqx.field(default=13.8, converter=_number)
 

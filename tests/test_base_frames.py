@@ -21,9 +21,9 @@ MOTION = (jnp.asarray(0.01), jnp.asarray(0.02))
 N = 40
 
 
-@partial(jax.jit, static_argnames=("frames", "noise_px"))
-def begin(key, frames=8, noise_px=0.1):
-    e = paper_experiment(key, n_points=N, n_frames=frames, noise_px=noise_px)
+@jax.jit
+def begin(key, noise_px=0.1):
+    e = paper_experiment(key, n_points=N, n_frames=8, noise_px=noise_px)
     R = SO3.from_matrix(e.rotations[1])
     return e, refine(e.translations[1], R, e.observed[0], e.observed[1], jnp.ones(N, bool), e.sigma)
 
@@ -68,7 +68,7 @@ def test_two_base_frames_are_the_trifocal_filter(seed):
         a, b = (np.asarray(ours[1])[pose], np.asarray(theirs.covariance)[pose])
         s = np.sqrt(np.diagonal(b, axis1=1, axis2=2))
         assert np.abs((a - b) / (s[:, :, None] * s[:, None])).max() < 0.5 * noise_px
-    assert apart[1] < 0.2 * apart[0] < 0.1
+    assert apart[1] < 0.3 * apart[0] < 0.01
 
 
 def test_the_measurement_is_that_of_the_trifocal_model():
@@ -201,26 +201,35 @@ def test_measured_derivatives(based):
     np.testing.assert_allclose(got.spread, B[jnp.arange(N), :, jnp.arange(N)], atol=1e-10)
 
 
-def test_gradient_through_a_frame_that_becomes_a_base_frame(based):
+def test_gradient_through_a_change_of_base_frames(based):
+    """Of what is around the update, whose own gradient `test_schmidt` checks."""
     model, belief, e = based
-    everything, yes, slot = jnp.ones(N, bool), jnp.asarray(True), jnp.asarray(1)
+    fresh, slot = jnp.arange(N) < 5, jnp.asarray(1)
 
     @jax.jit
+    @jax.value_and_grad
     def loss(x):
-        scaled = BaseFrames(model.sigma * jnp.exp(x[0]), *(jnp.exp(x[1]) * a for a in MOTION))
-        after, says = base_frames.step(scaled, belief, e.observed[-1], everything, yes, slot, passes=2)
-        return says.log_likelihood + jnp.sum(after.mean.points.point) + 1e6 * jnp.trace(after.own)
+        scaled = BaseFrames(model.sigma * jnp.exp(x[0]), *MOTION)
+        ready = base_frames.release(scaled, base_frames.forget(scaled, belief, fresh), slot)
+        at = scaled.measured(ready.mean, None, jnp.zeros((N, 3)))
+        gain = jnp.exp(x[1]) * at.spread.mT
+        said = schmidt.ItemUpdate(jnp.einsum("npm,nm->np", gain, e.observed[-1] - at.predicted), gain, at)
+        promoted = base_frames.promote(ready, slot, said)
+        after = base_frames.begin(scaled, promoted, slot, e.observed[-1], fresh, jnp.exp(x[1]), jnp.exp(x[0]))
+        whole = schmidt.total(scaled, after, None).covariance
+        p = after.mean.points
+        return jnp.sum(p.point) + 1e-6 * jnp.sum(p.noise) + 1e6 * jnp.trace(whole)
 
     x = jnp.array([0.1, -0.2])
-    slope = jax.jit(jax.grad(loss))(x)
+    slope = loss(x)[1]
     step = 1e-5
     for i in range(2):
         d = jnp.zeros(2).at[i].set(step)
-        np.testing.assert_allclose(slope[i], (loss(x + d) - loss(x - d)) / (2 * step), rtol=1e-5)
+        np.testing.assert_allclose(slope[i], (loss(x + d)[0] - loss(x - d)[0]) / (2 * step), rtol=1e-5)
 
 
 def test_outliers_and_blind_frames():
-    e, view = begin(jax.random.key(9), frames=8)
+    e, view = begin(jax.random.key(9))
     model, everything = BaseFrames(e.sigma, *MOTION), jnp.ones(N, bool)
     belief = base_frames.start(view, e.observed[0], e.observed[1], everything, e.sigma, 4, **SD)
     step = jax.jit(partial(base_frames.step, passes=9))

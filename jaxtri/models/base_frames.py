@@ -160,6 +160,17 @@ def start(
     return Belief(BaseFramesState(motion, bases, points), own, by_points)
 
 
+def informative(
+    model: BaseFrames, belief: Belief[BaseFramesState], smallest: Float[Array, ""] | float
+) -> Bool[Array, " n"]:
+    """Points whose inverse depth is at least `smallest` times its standard deviation: others are not to be used.
+
+    A point near the epipole of its base frames says nothing, and a linear model of it is wrong.
+    """
+    p = belief.mean.points
+    return p.point[:, 3] > smallest * model.sigma * jnp.sqrt(p.noise[:, 2, 2])
+
+
 def release(model: BaseFrames, belief: Belief[BaseFramesState], slot: Int[Array, ""]) -> Belief[BaseFramesState]:
     """The belief without the base frame in `slot` (0 to K - 2), which then holds nothing.
 
