@@ -26,14 +26,16 @@ displacements are drawn anew in every frame, which no constant velocity foretell
     bases8          R     T     NEES                coverage
     paper           1.07  1.02  6.4 (5.9-7.2)       .929
     sideways        1.45  1.07  7.2 (5.8-11.2)      .894
+    forward         1.04  1.04  6.3 (6.1-6.7)       .940
     orbit           1.43  1.24  8.3 (5.8-13.8)      .838
     rotation        1.55  1.18  6.3 (5.7-7.2)       .933
     30 points       1.12  1.01  9.5 (5.8-17.2)      .809
     30 points, wide 1.12  1.08  6.8 (6.0-7.8)       .918
     1 px            1.16  1.08  11.8 (6.1-22.6)     .761
+    1 px, wide      1.05  1.00  6.7 (6.2-7.7)       .917
     paper           26.8  50    4e5                 .000  `paper` mode; elsewhere R 1.7 to 5, .01 to .06
     paper           2.15  1.36  451 (18.7-616)      .104  `two_step_good`; elsewhere R 1.3 to 26, .002 to .24
-`ap_good` has not been run at this length; those of 8 base frames but 30 points and 1 px ran before `informative` left
+`ap_good` has not been run at this length; paper, sideways, orbit, rotation and 30 wide ran before `informative` left
 points out, which changed the row of 30 points by nothing.
 """
 
