@@ -2,11 +2,12 @@
 
 The trifocal filter knows a point from a pair of base frames. Here the pair's point goes on: whatever frame is
 made a base frame adds its observation to the point by least squares, given the base poses, which are in the
-state. The structure itself is not: a point moves with the errors of the base poses (`lever`) and has
-an error of its own, which `jaxtri.schmidt` considers. A lever is that of the point as the current frame
-corrects it (`slope`): taken where a noisy point stands it has an error in common with the innovation, which
-adds up to a drift of the scale. So a frame costs O(N), no information of a base frame is
-lost and none is counted twice. With the pair alone it is the trifocal filter, to first order.
+state. The structure itself is not: a point moves with the errors of the base poses (`lever`) and has an error
+of its own, which `jaxtri.schmidt` considers. So a frame costs O(N), no information of a base frame is lost and
+none is counted twice. With the pair alone it is the trifocal filter, to first order.
+
+A lever is that of the point as the current frame corrects it (`slope`): taken where a noisy point stands it
+has an error in common with the innovation, which adds up to a drift of the scale.
 
 A point may begin in any base frame, with a prior on its inverse depth. A base frame that makes room for
 another is written as a function of those that stay; what these do not know of it becomes an error of the
@@ -86,8 +87,7 @@ class BaseFrames(eqx.Module):
         """All points in the current view."""
         p, motion = mean.points, mean.motion
         pose = motion.pose
-        # The error of the pose, as a left perturbation, owes to that of the motion alone.
-        onto = jax.jacfwd(lambda e: local(pose, retract(motion, e).pose))(jnp.zeros(12, p.point.dtype))
+        onto = _of_pose(motion)
 
         def one(p: Points, m: Array) -> tuple[Array, Array, Array]:
             y, A, B = _derivatives(pose, p.point + p.basis @ m)
@@ -99,6 +99,12 @@ class BaseFrames(eqx.Module):
     def item_noise(self, mean: BaseFramesState, items: None) -> Float[Array, "n 3 3"]:
         """What the base poses have no part in."""
         return jnp.square(self.sigma) * mean.points.noise
+
+
+def _of_pose(motion: Kinematics | Twist) -> Float[Array, "6 12"]:
+    """Derivative of the error of the pose, a left perturbation, with respect to that of the motion."""
+    pose = motion.pose
+    return jax.jacfwd(lambda e: local(pose, retract(motion, e).pose))(jnp.zeros(12, pose.wxyz_xyz.dtype))
 
 
 def _derivatives(pose: SE3, X: Float[Array, "4"]) -> tuple[Float[Array, "2"], Float[Array, "2 6"], Float[Array, "2 4"]]:
@@ -223,7 +229,7 @@ def promote(belief: Belief[BaseFramesState], slot: Int[Array, ""], said: schmidt
     mean, p = belief.mean, belief.mean.points
     pose, dtype = mean.motion.pose, belief.own.dtype
     at = 6 * slot + jnp.arange(6)
-    onto = jax.jacfwd(lambda e: local(pose, retract(mean.motion, e).pose))(jnp.zeros(12, dtype))
+    onto = _of_pose(mean.motion)
 
     def one(p: Points, moved: Array, k: Array, B: Array) -> Points:
         def lever(further: Array) -> Array:
