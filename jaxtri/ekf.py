@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Mean = TypeVar("Mean")
+Taken = TypeVar("Taken", bound=PyTree)
 
 
 class Belief(eqx.Module, Generic[Mean]):
@@ -94,6 +95,9 @@ class Diagnostics(eqx.Module):
     `used * m` degrees of freedom for a consistent filter), are taken at the last linearisation; with robust
     weights both are those of the weighted items, the gated ones left out. `distance` is m2 of every item
     after the update under the measurement noise alone (zero where masked).
+
+    An update that overflows, as that of a filter which has long lost the track may, is not taken: the belief
+    stays as predicted, `used` is zero and `log_likelihood` minus infinity.
     """
 
     log_likelihood: Float[Array, ""]
@@ -222,6 +226,17 @@ def _moved(lin: _Linearisation, step: Array) -> _Linearisation:
     return _Linearisation(residual, lin.jacobian, lin.whitener, lin.log_det)
 
 
+def unless_overflown(
+    prior: Taken, posterior: Taken, diagnostics: Diagnostics
+) -> tuple[Taken, Diagnostics, Bool[Array, ""]]:
+    """The posterior and its diagnostics, or where any number of these is not finite the prior; and whether all are."""
+    finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves((posterior, diagnostics))]).all()
+    belief = jax.tree.map(lambda new, old: jnp.where(finite, new, old), posterior, prior)
+    nothing = jax.tree.map(jnp.zeros_like, diagnostics)
+    nothing = eqx.tree_at(lambda d: d.log_likelihood, nothing, -jnp.full_like(diagnostics.log_likelihood, jnp.inf))
+    return belief, jax.tree.map(lambda x, y: jnp.where(finite, x, y), diagnostics, nothing), finite
+
+
 def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
     """Derivative of the error after one time step with respect to the error before it."""
     after = model.predict(mean, dt)
@@ -330,7 +345,7 @@ def update(
         weights=weights,
         distance=_distance(_moved(lin, final - delta)),
     )
-    return posterior, diagnostics
+    return unless_overflown(belief, posterior, diagnostics)[:2]
 
 
 def step(

@@ -183,9 +183,12 @@ def update(
         mean, moved = carry
         reset, centre = prior_at(mean)
         lin = _linearise(model, mean, items, moved, item_noise, observed, present)
-        H, v = lin.whitened(ekf.safe_root(weigh(lin, k)))
+        weights = weigh(lin, k)
+        H, v = lin.whitened(ekf.safe_root(weights))
         e = centre + ekf.posterior_error(reset @ P @ reset.T, H.T @ H, H.T @ (v - H @ centre))
-        return model.retract(mean, e), lin.item_update(e).moved
+        # An outlier says nothing of its item, which it might move to where the measurement is singular.
+        believed = jnp.where(mask, weights, 1.0)[:, None]
+        return model.retract(mean, e), believed * lin.item_update(e).moved
 
     mean, moved = jax.lax.fori_loop(0, passes - 1, iterate, (belief.mean, still))
     reset, centre = prior_at(mean)
@@ -243,8 +246,10 @@ def update(
         weights=weights,
         distance=jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1),
     )
-    moved, gain = ekf.replace_masked(absorbed, (said.moved, said.gain), 0.0)
-    return posterior, diagnostics, ItemUpdate(moved, gain, lin.at)
+    posterior, diagnostics, finite = ekf.unless_overflown(belief, posterior, diagnostics)
+    moved, gain = ekf.replace_masked(absorbed & finite, (said.moved, said.gain), 0.0)
+    at = ekf.replace_masked(jnp.broadcast_to(finite, mask.shape), lin.at, 0.0)
+    return posterior, diagnostics, ItemUpdate(moved, gain, Measured(*at))
 
 
 def step(

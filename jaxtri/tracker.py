@@ -182,9 +182,7 @@ def judge(
     Also whether the update stands, and the frames coasted since the last that did.
     """
     count = jnp.sum(mask).astype(settings.minimum.dtype)
-    agreeing = diagnostics.used >= jnp.maximum(settings.minimum, 0.25 * count)
-    finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(updated)])
-    ok = agreeing & jnp.all(finite)
+    ok = diagnostics.used >= jnp.maximum(settings.minimum, 0.25 * count)
     belief = jax.tree.map(lambda a, b: jnp.where(ok, a, b), updated, predicted)
     coasted = jnp.where(ok, 0, coasted + 1)
     # Tracks do not come back: with too few of them left no later frame can agree either.

@@ -282,6 +282,18 @@ def test_information_and_gains_equal_the_sums_over_items():
     np.testing.assert_allclose(gains, np.stack(shares), atol=1e-7 * np.abs(shares).max())
 
 
+def test_an_update_that_overflows_is_not_taken():
+    model, belief = sextant()
+    landmarks, observed, mask, _ = sextant_frames()
+    mask = mask[0].at[0].set(True)
+    z = observed[0].at[0].set(1e200)  # its square is infinite
+    after, says = jax.jit(ekf.update)(model, belief, landmarks, z, mask)
+    jax.tree.map(np.testing.assert_array_equal, after, belief)
+    assert (int(says.used), float(says.log_likelihood), float(says.nis)) == (0, -np.inf, 0)
+    assert not np.any(says.weights)
+    assert not np.any(says.distance)
+
+
 @jax.jit
 def log_likelihood(model, belief, items, observed, mask):
     mask = jnp.broadcast_to(mask, observed.shape[:2])

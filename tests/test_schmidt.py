@@ -181,6 +181,17 @@ def test_float32_covariances_stay_positive(problem):
     assert np.linalg.eigvalsh(np.asarray(beliefs.covariance, np.float64)).min() > 0
 
 
+def test_an_update_that_overflows_is_not_taken(problem):
+    model, belief, items, observed, mask = problem
+    seen = mask[0].at[0].set(True)
+    after, says, of_items = jax.jit(schmidt.update)(
+        model, belief, items, observed[0].at[0].set(1e200), seen, absorb=seen
+    )
+    jax.tree.map(np.testing.assert_array_equal, after, belief)
+    assert (int(says.used), float(says.log_likelihood)) == (0, -np.inf)
+    assert not any(np.any(x) for x in jax.tree.leaves(of_items))
+
+
 def test_outliers_lose_their_weight(problem):
     model, belief, (H, B, _), *_ = problem
     truth = belief.mean + 0.5

@@ -23,7 +23,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import schmidt
-from jaxtri.ekf import Diagnostics, Robust
+from jaxtri.ekf import Diagnostics, Robust, unless_overflown
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.geometry.pose import local, retract, shear
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, from_two_view, twist_noise
@@ -313,4 +313,8 @@ def step(
     updated, diagnostics, said = schmidt.update(
         model, ready, None, observed, mask, absorb=mask & base, passes=passes, robust=robust
     )
-    return jax.lax.cond(base, lambda x: promote(x, slot, said), lambda x: x, updated), diagnostics
+
+    def kept(belief: Belief[BaseFramesState]) -> tuple[Belief[BaseFramesState], Diagnostics]:
+        return unless_overflown(predicted, promote(belief, slot, said), diagnostics)[:2]
+
+    return jax.lax.cond(base, kept, lambda x: (x, diagnostics), updated)
