@@ -13,8 +13,9 @@ over the last ten frames used less than half of its points, or is not finite.
 Last answer (2 cores, JAX 0.10, float64, default mode, 200 trials, --seed 0; lost, mean of the others in degrees):
 none 0, .0051; frame25 0, .0059; frame40 0, .0066; persistent25 0, .0060; frame40_persistent25 0, .0078; moving30 0,
 .0062; the worst of all 1,200 is at .010 degrees. Nothing flagged in vain.
-`consistent`: 0, .0049; 0, .0058; 0, .0065; 0, .0058; 0, .0075; 0, .0059; worst .0093. 12 to 20 minutes a mode with
-other load. With weights that start at 1e4 instead of 1e5 a sudden move lost one trial of frame40 (12 degrees) and hurt
+`consistent`: 0, .0049; 0, .0058; 0, .0065; 0, .0058; 0, .0075; 0, .0059; worst .0093.
+`bases8`: 0, .0037; 0, .0043; 0, .0048; 0, .0043; 0, .0056; 0, .0044; worst .0074. 12 to 37 minutes a mode with other
+load. With weights that start at 1e4 instead of 1e5 a sudden move lost one trial of frame40 (12 degrees) and hurt
 one of frame40_persistent25 (.14).
 """
 

@@ -8,8 +8,9 @@ passes. Lower table: one pass each, as published. Then the growth with the numbe
 time against log N.
 
 Last answer (2 cores, JAX 0.10, float64, --seed 2006; over the pose alone, in brackets the paper): pose and
-structure 1.05 to 1.15 (1.07), A-P 36 (1.67), two-step .93 (.27); as published 1.35, 66, 1.10. Growth N^.7, N^.7,
-N^2.35, N^1.0 up to N = 3000 (A-P 1000).
+structure 1.05 to 1.15 (1.07), A-P 28 to 36 (1.67), two-step .9 (.27); as published 1.3, 52 to 66, 1.05. Pose in
+`consistent` mode 2.3, from 2, 4 and 8 base frames 1.9, 2.6, 5.0. Growth N^.7 to N^.8, A-P N^2.4, up to N = 3000 (A-P
+1000).
 """
 
 import time
