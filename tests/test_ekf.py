@@ -255,6 +255,62 @@ def test_considered_components_are_counted_and_not_corrected():
     np.testing.assert_allclose(told.nis, plain.nis, rtol=1e-9)
 
 
+@pytest.mark.parametrize("kind", [Linear, PartlyConsidered])
+def test_smoothed_covariances_are_those_of_the_errors(kind):
+    """Exactly: a linear smoother's error is a linear function of all that is drawn."""
+    rng, d, n, frames = np.random.default_rng(4), 4, 3, 5
+    static = np.array([False, True, False, True])
+    F, A, B = (rng.normal(size=(d, d)) for _ in range(3))
+    F, A = np.where(static[:, None], 0, 0.3 * F), np.where(static[:, None], 0, A)
+    B[2] = 0  # one component is known at the start
+    H, C = rng.normal(size=(n, 2, d)), 0.5 * rng.normal(size=(n, 2, 2))
+    mask, dt = rng.uniform(size=(frames, n)) > 0.3, rng.uniform(0.5, 2, frames)
+    model, items = kind(jnp.asarray(F), jnp.asarray(A @ A.T)), {"H": jnp.asarray(H), "R": jnp.asarray(C @ C.mT)}
+
+    def draw(w):
+        first, accelerations, noises = jnp.split(w, [d, d + d * frames])
+        x, states = B @ first, []
+        for k, a in enumerate(accelerations.reshape(frames, d)):
+            x = x + dt[k] * F @ x + np.sqrt(dt[k]) * A @ a
+            states.append(x)
+        states = jnp.stack(states)
+        noises = noises.reshape(frames, n, 2)
+        return states, jnp.einsum("nij,tj->tni", H, states) + jnp.einsum("nij,tnj->tni", C, noises)
+
+    def run(w):
+        (states, observed), times = draw(w), jnp.asarray(dt)
+        belief = ekf.Belief(jnp.zeros(d), jnp.asarray(B @ B.T))
+        filtered, _ = ekf.filter(model, belief, items, observed, jnp.asarray(mask), times, passes=1)
+        smoothed = ekf.smooth(model, filtered, times)
+        return (smoothed.mean - states, observed), (smoothed, filtered)
+
+    (J, seen), (smoothed, filtered) = jax.jit(jax.jacfwd(run, has_aux=True))(jnp.zeros(d + frames * (d + 2 * n)))
+    np.testing.assert_allclose(smoothed.covariance, J @ J.mT, atol=1e-9)
+    np.testing.assert_array_equal(smoothed.covariance[-1], filtered.covariance[-1])
+    if kind is Linear:
+        less = np.linalg.eigvalsh(filtered.covariance - smoothed.covariance)
+        assert less.min() > -1e-9
+        assert (less.max(axis=1)[:-1] > 1e-3).all()
+        # The best there is: nothing is left in common with what was seen.
+        np.testing.assert_allclose(np.einsum("tiw,snjw->snjti", J, seen)[mask], 0, atol=1e-9)
+
+
+def test_smoothing_a_rotating_camera():
+    """Closer to the truth than the filter, and by as much as it says."""
+    model, belief = sextant()
+    landmarks, observed, mask, states = sextant_frames()
+    filtered, _ = filter_(model, belief, landmarks, observed, mask, passes=4)
+    smoothed = jax.jit(ekf.smooth)(model, filtered)
+
+    def nees_and_square(beliefs):
+        error = jax.vmap(model.local)(beliefs.mean, states)
+        return jnp.einsum("ti,tij,tj->t", error, jnp.linalg.inv(beliefs.covariance), error), jnp.sum(error**2, axis=1)
+
+    (nees, square), (_, before) = (jax.jit(nees_and_square)(x) for x in (smoothed, filtered))
+    assert 5 < nees.mean() < 7
+    assert square.mean() < 0.75 * before.mean()
+
+
 def test_prediction_equals_the_dense_one():
     model, belief = sextant()
     dt = jnp.asarray(1.5)
