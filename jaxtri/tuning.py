@@ -1,0 +1,180 @@
+"""Fit what a filter was told - noises, priors, intrinsics - to what it saw, by the gradient of its run.
+
+A loss is any scalar of a model and data: the negative log-likelihood of the innovations, the pose error against
+ground truth, the reprojection error. A parameter is any leaf of the model, which is any pytree.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float
+from tqdm import tqdm
+
+from jaxtri.ekf import Diagnostics
+from jaxtri.errors import InputError
+from jaxtri.geometry.epipolar import dehomogenise
+from jaxtri.trajectory import nees
+
+M = TypeVar("M")
+D = TypeVar("D")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A leaf to fit, scalar or array: `where` picks it from the model.
+
+    With `log` the fit runs over log(value - floor): for what is positive. A noise that the data do not bound
+    from below runs to zero: give it a `floor`, or a prior. `prior_sd` is the standard deviation of a Gaussian
+    prior about the value at the start, of the logarithm with `log`; it weighs as one observation of the loss.
+    """
+
+    where: Callable[[Any], Array]
+    log: bool = True
+    floor: float = 0.0
+    prior_sd: float | None = None
+
+    def free(self, value: Array) -> Array:
+        """The number that is fitted."""
+        return jnp.log(value - self.floor) if self.log else value
+
+    def value(self, free: Array) -> Array:
+        """The leaf, from the number that is fitted."""
+        return self.floor + jnp.exp(free) if self.log else free
+
+
+@dataclass(frozen=True)
+class Fit(Generic[M]):
+    """What a fit found: the model, the losses before and after, and each parameter's values before and after."""
+
+    model: M
+    converged: bool
+    loss_before: float
+    loss_after: float
+    steps: int
+    changes: dict[str, tuple[np.ndarray, np.ndarray]]
+
+    def __str__(self) -> str:
+        end = "converged" if self.converged else "not converged"
+        lines = [f"loss {self.loss_before:.6g} -> {self.loss_after:.6g}, {end} after {self.steps} steps"]
+        for name, (before, after) in self.changes.items():
+            with np.printoptions(precision=4):
+                lines.append(f"{name}: {before} -> {after}")
+        return "\n".join(lines)
+
+
+def fit(
+    model: M,
+    data: D,
+    parameters: Mapping[str, Parameter],
+    loss: Callable[[M, D], Float[Array, ""]],
+    solver: optx.AbstractMinimiser | None = None,
+    *,
+    starts: int = 1,
+    spread: float = 1.0,
+    seed: int = 0,
+    max_steps: int = 64,
+    forward: bool | None = None,
+    progress: bool = True,
+) -> Fit[M]:
+    """The model whose `parameters` minimise `loss(model, data)`, every other leaf as it is.
+
+    The solver is BFGS by default. The first start is the model itself, further ones are drawn about it with the
+    standard deviation `spread` (of the logarithm, where that is fitted). The gradient is taken in forward mode
+    for up to four numbers and in reverse for more, or as `forward` says. Losses should be of order one, a mean
+    over the data, for the first step to be of a sensible length. Host only.
+
+    Raises `InputError` where a parameter cannot be fitted as it stands or the loss at the start is not finite.
+    """
+    leaves = {name: jnp.asarray(p.where(model)) for name, p in parameters.items()}
+    for name, p in parameters.items():
+        if p.log and not bool(jnp.all(leaves[name] > p.floor)):
+            raise InputError(f"{name} is {leaves[name]}: to be fitted by its logarithm it must be above {p.floor:g}")
+    first = {name: p.free(leaves[name]) for name, p in parameters.items()}
+
+    def put(free: Mapping[str, Array]) -> M:
+        wheres = [p.where for p in parameters.values()]
+        values = [p.value(free[name]).astype(leaves[name].dtype) for name, p in parameters.items()]
+        return eqx.tree_at(lambda m: [w(m) for w in wheres], model, values)
+
+    bar = tqdm(total=starts * max_steps, desc="fit", leave=False, disable=None if progress else True)
+
+    def show(value: Array) -> None:
+        bar.update()
+        bar.set_postfix_str(f"loss {float(value):.6g}", refresh=False)
+
+    def objective(free: Mapping[str, Array], data: D) -> Float[Array, ""]:
+        value = loss(put(free), data)
+        jax.debug.callback(show, value)
+        for name, p in parameters.items():
+            if p.prior_sd is not None:
+                value = value + jnp.sum(jnp.square((free[name] - first[name]) / p.prior_sd)) / 2
+        return value
+
+    value = jax.jit(objective)
+    before = float(value(first, data))
+    if not math.isfinite(before):
+        raise InputError(f"the loss at the start is {before}: begin with larger noises, or look for NaN in the data")
+    count = sum(x.size for x in leaves.values())
+    options = {"autodiff_mode": "fwd" if (count <= 4 if forward is None else forward) else "bwd"}
+    solver = optx.BFGS(rtol=1e-6, atol=1e-6) if solver is None else solver
+    found, best, key = None, before, jax.random.key(seed)
+    for k in range(starts):
+        begun = first
+        if k:
+            keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
+            begun = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
+        solution = optx.minimise(objective, solver, begun, data, options, max_steps=max_steps, throw=False)
+        reached = float(value(solution.value, data))
+        if found is None or reached < best:  # False for NaN
+            found, best = solution, reached
+    bar.close()
+    assert found is not None
+    fitted = put(found.value)
+    changes = {n: (np.asarray(leaves[n]), np.asarray(p.where(fitted))) for n, p in parameters.items()}
+    converged = bool(found.result == optx.RESULTS.successful) and math.isfinite(best)
+    return Fit(fitted, converged, before, best, int(found.stats["num_steps"]), changes)
+
+
+def negative_log_likelihood(diagnostics: Diagnostics, components: int = 2) -> Float[Array, ""]:
+    """Of the innovations of a whole run, per component of a used measurement; infinite where an update was refused.
+
+    Of iterated updates it is Laplace's approximation, taken at the last linearisation.
+    """
+    count = jnp.maximum(jnp.sum(diagnostics.used), 1).astype(diagnostics.log_likelihood.dtype)
+    return -jnp.sum(diagnostics.log_likelihood) / (components * count)
+
+
+def nis_per_component(diagnostics: Diagnostics, components: int = 2) -> Float[Array, ""]:
+    """Normalised innovation squared of a whole run over its degrees of freedom: 1 is right."""
+    count = jnp.maximum(jnp.sum(diagnostics.used), 1).astype(diagnostics.nis.dtype)
+    return jnp.sum(diagnostics.nis) / (components * count)
+
+
+def nees_loss(errors: Float[Array, "*batch d"], covariance: Float[Array, "*batch d d"]) -> Float[Array, ""]:
+    """Squared logarithm of the mean normalised error squared over its expectation d: zero is right."""
+    return jnp.square(jnp.log(jnp.mean(nees(errors, covariance)) / errors.shape[-1]))
+
+
+def reprojection_loss(
+    points: Float[Array, "n 3"],
+    poses: SE3,
+    observed: Float[Array, "t n 2"],
+    mask: Bool[Array, "t n"],
+) -> Float[Array, ""]:
+    """Mean square of the reprojection errors, normalised image units, of world points in the `poses` (t,)."""
+
+    def one(pose: SE3, u: Array, seen: Array) -> Array:
+        X = points @ pose.rotation().as_matrix().T + pose.translation()
+        X = jnp.where(seen[:, None], X, jnp.ones_like(X))
+        return jnp.sum(jnp.where(seen[:, None], jax.vmap(dehomogenise)(X) - u, 0.0) ** 2)
+
+    total = jnp.sum(jax.vmap(one)(poses, jnp.where(mask[..., None], observed, 0.0), mask))
+    return total / jnp.maximum(2 * jnp.sum(mask), 1).astype(total.dtype)
