@@ -184,14 +184,28 @@ def _normal_equations(lin: _Linearisation, weights: Array, delta: Array) -> tupl
     return H.T @ H, H.T @ (r + H @ delta)
 
 
+def scales(P: Float[Array, "d d"]) -> Float[Array, " d"]:
+    """Standard deviations of a covariance, to scale its coordinates by; 1 where there is no uncertainty."""
+    variance = jnp.diagonal(P)
+    return jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
+
+
+def regression(P: Float[Array, "d d"], cross: Float[Array, "d e"]) -> Float[Array, "e d"]:
+    """cross' P^-1, what errors of covariance P say of others; a P that may be singular, where `cross` is zero, too."""
+    s = scales(P)
+    # Any regression is right, its remainder being what it is; a ridge makes it one.
+    ridge = 10 * len(P) * jnp.finfo(P.dtype).eps
+    scaled = P / jnp.outer(s, s) + ridge * jnp.eye(len(P), dtype=P.dtype)
+    return (jnp.linalg.solve(scaled, cross / s[:, None]) / s[:, None]).T
+
+
 def _system(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """I + P A, P and A in coordinates scaled by the prior's standard deviations, and these.
 
     Without scaling float32 does not survive; A alone is never inverted (a scale it does not see leaves it
     rank deficient), nor is P (a pinned direction has no uncertainty).
     """
-    variance = jnp.diagonal(P)
-    s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
+    s = scales(P)
     Ps, As = P / jnp.outer(s, s), A * jnp.outer(s, s)
     return jnp.eye(s.size, dtype=P.dtype) + Ps @ As, Ps, As, s
 
@@ -232,9 +246,9 @@ def unless_overflown(
     """The posterior and its diagnostics, or where any number of these is not finite the prior; and whether all are."""
     finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves((posterior, diagnostics))]).all()
     belief = jax.tree.map(lambda new, old: jnp.where(finite, new, old), posterior, prior)
-    nothing = jax.tree.map(jnp.zeros_like, diagnostics)
-    nothing = eqx.tree_at(lambda d: d.log_likelihood, nothing, -jnp.full_like(diagnostics.log_likelihood, jnp.inf))
-    return belief, jax.tree.map(lambda x, y: jnp.where(finite, x, y), diagnostics, nothing), finite
+    nothing = jax.tree.map(lambda x: jnp.where(finite, x, 0), diagnostics)
+    unlikely = jnp.where(finite, diagnostics.log_likelihood, -jnp.inf)
+    return belief, eqx.tree_at(lambda d: d.log_likelihood, nothing, unlikely), finite
 
 
 def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
@@ -406,7 +420,7 @@ def smooth(model: Dynamics[Mean], beliefs: Belief[Mean], dt: Float[Array, " t"] 
         now, elapsed = frame
         F, Q = transition(model, now.mean, elapsed), model.process_noise(now.mean, elapsed)
         P, predicted = now.covariance, model.predict(now.mean, elapsed)
-        G = _smoother_gain(F @ P @ F.T + Q, F @ P)
+        G = regression(F @ P @ F.T + Q, F @ P)
         zero = jnp.zeros(len(P), P.dtype)
         onto = G @ jax.jacfwd(lambda x: model.local(predicted, model.retract(later.mean, x)))(zero)
         delta = G @ model.local(predicted, later.mean)
@@ -421,12 +435,3 @@ def smooth(model: Dynamics[Mean], beliefs: Belief[Mean], dt: Float[Array, " t"] 
     earlier = jax.tree.map(lambda x: x[:-1], beliefs)
     _, found = jax.lax.scan(body, last, (earlier, dt[1:]), reverse=True)
     return jax.tree.map(lambda x, end: jnp.concatenate([x, end[None]]), found, last)
-
-
-def _smoother_gain(prior: Float[Array, "d d"], cross: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """cross' prior^-1, of a covariance that may be singular; there `cross` is zero, too."""
-    variance = jnp.diagonal(prior)
-    s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
-    ridge = 10 * len(prior) * jnp.finfo(prior.dtype).eps
-    scaled = prior / jnp.outer(s, s) + ridge * jnp.eye(len(prior), dtype=prior.dtype)
-    return (jnp.linalg.solve(scaled, cross / s[:, None]) / s[:, None]).T

@@ -204,8 +204,7 @@ def update(
     cross = jnp.einsum("nmp,npq,dnq->nmd", lin.at.spread, item_noise, belief.sensitivity)
     cross = jnp.einsum("n,nij,njd->nid", root, lin.whitener, cross).reshape(-1, d) @ reset.T
     prior = reset @ P @ reset.T
-    variance = jnp.diagonal(prior)
-    s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
+    s = ekf.scales(prior)
     G = jnp.concatenate([H * s, cross / s], axis=1)
     zero, eye = jnp.zeros((d, d), dtype), jnp.eye(d, dtype=dtype)
     inner = jnp.block([[zero, eye], [eye, -prior / jnp.outer(s, s)]]) + G.T @ G
@@ -247,9 +246,8 @@ def update(
         distance=jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1),
     )
     posterior, diagnostics, finite = ekf.unless_overflown(belief, posterior, diagnostics)
-    moved, gain = ekf.replace_masked(absorbed & finite, (said.moved, said.gain), 0.0)
-    at = ekf.replace_masked(jnp.broadcast_to(finite, mask.shape), lin.at, 0.0)
-    return posterior, diagnostics, ItemUpdate(moved, gain, Measured(*at))
+    moved, gain = ekf.replace_masked(absorbed, (said.moved, said.gain), 0.0)
+    return posterior, diagnostics, jax.tree.map(lambda x: jnp.where(finite, x, 0), ItemUpdate(moved, gain, lin.at))
 
 
 def step(

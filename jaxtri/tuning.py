@@ -18,9 +18,9 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 from tqdm import tqdm
 
-from jaxtri.ekf import Diagnostics
+from jaxtri.ekf import Diagnostics, stand_in
 from jaxtri.errors import InputError
-from jaxtri.geometry.epipolar import dehomogenise
+from jaxtri.geometry.trifocal import project
 from jaxtri.trajectory import nees
 
 M = TypeVar("M")
@@ -104,15 +104,8 @@ def fit(
         values = [p.value(free[name]).astype(leaves[name].dtype) for name, p in parameters.items()]
         return eqx.tree_at(lambda m: [w(m) for w in wheres], model, values)
 
-    bar = tqdm(total=starts * max_steps, desc="fit", leave=False, disable=None if progress else True)
-
-    def show(value: Array) -> None:
-        bar.update()
-        bar.set_postfix_str(f"loss {float(value):.6g}", refresh=False)
-
     def objective(free: Mapping[str, Array], data: D) -> Float[Array, ""]:
         value = loss(put(free), data)
-        jax.debug.callback(show, value)
         for name, p in parameters.items():
             if p.prior_sd is not None:
                 value = value + jnp.sum(jnp.square((free[name] - first[name]) / p.prior_sd)) / 2
@@ -125,17 +118,29 @@ def fit(
     count = sum(x.size for x in leaves.values())
     options = {"autodiff_mode": "fwd" if (count <= 4 if forward is None else forward) else "bwd"}
     solver = optx.BFGS(rtol=1e-6, atol=1e-6) if solver is None else solver
-    found, best, key = None, before, jax.random.key(seed)
-    for k in range(starts):
-        begun = first
-        if k:
-            keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
-            begun = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
-        solution = optx.minimise(objective, solver, begun, data, options, max_steps=max_steps, throw=False)
-        reached = float(value(solution.value, data))
-        if found is None or reached < best:  # False for NaN
-            found, best = solution, reached
-    bar.close()
+    found, best, key = None, math.inf, jax.random.key(seed)
+    with tqdm(total=starts * max_steps, desc="fit", leave=False, disable=None if progress else True) as bar:
+
+        def show(value: Array) -> None:
+            bar.update()
+            bar.set_postfix_str(f"loss {float(value):.6g}", refresh=False)
+
+        def watched(free: Mapping[str, Array], data: D) -> Float[Array, ""]:
+            value = objective(free, data)
+            jax.debug.callback(show, value)
+            return value
+
+        for k in range(starts):
+            begun = first
+            if k:
+                keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
+                begun = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
+            solution = optx.minimise(watched, solver, begun, data, options, max_steps=max_steps, throw=False)
+            reached = float(value(solution.value, data))
+            reached = math.inf if math.isnan(reached) else reached
+            if found is None or reached < best:
+                found, best = solution, reached
+        jax.effects_barrier()  # the bar's last updates come before it closes
     assert found is not None
     fitted = put(found.value)
     changes = {n: (np.asarray(leaves[n]), np.asarray(p.where(fitted))) for n, p in parameters.items()}
@@ -148,14 +153,16 @@ def negative_log_likelihood(diagnostics: Diagnostics, components: int = 2) -> Fl
 
     Of iterated updates it is Laplace's approximation, taken at the last linearisation.
     """
-    count = jnp.maximum(jnp.sum(diagnostics.used), 1).astype(diagnostics.log_likelihood.dtype)
-    return -jnp.sum(diagnostics.log_likelihood) / (components * count)
+    return -_per_component(diagnostics.log_likelihood, diagnostics, components)
 
 
 def nis_per_component(diagnostics: Diagnostics, components: int = 2) -> Float[Array, ""]:
     """Normalised innovation squared of a whole run over its degrees of freedom: 1 is right."""
-    count = jnp.maximum(jnp.sum(diagnostics.used), 1).astype(diagnostics.nis.dtype)
-    return jnp.sum(diagnostics.nis) / (components * count)
+    return _per_component(diagnostics.nis, diagnostics, components)
+
+
+def _per_component(x: Float[Array, " t"], diagnostics: Diagnostics, components: int) -> Float[Array, ""]:
+    return jnp.sum(x) / (components * jnp.maximum(jnp.sum(diagnostics.used), 1)).astype(x.dtype)
 
 
 def nees_loss(errors: Float[Array, "*batch d"], covariance: Float[Array, "*batch d d"]) -> Float[Array, ""]:
@@ -171,10 +178,13 @@ def reprojection_loss(
 ) -> Float[Array, ""]:
     """Mean square of the reprojection errors, normalised image units, of world points in the `poses` (t,)."""
 
-    def one(pose: SE3, u: Array, seen: Array) -> Array:
-        X = points @ pose.rotation().as_matrix().T + pose.translation()
-        X = jnp.where(seen[:, None], X, jnp.ones_like(X))
-        return jnp.sum(jnp.where(seen[:, None], jax.vmap(dehomogenise)(X) - u, 0.0) ** 2)
+    world = jnp.concatenate([points, jnp.ones_like(points[:, :1])], axis=1)
 
-    total = jnp.sum(jax.vmap(one)(poses, jnp.where(mask[..., None], observed, 0.0), mask))
+    def one(pose: SE3, u: Array, seen: Array) -> Array:
+        X, u = stand_in(seen, (world, u))
+        R, T = pose.rotation().as_matrix(), pose.translation()
+        error = jax.vmap(lambda x: project(x, R, T))(X) - u
+        return jnp.sum(jnp.where(seen[:, None], error, 0.0) ** 2)
+
+    total = jnp.sum(jax.vmap(one)(poses, observed, mask))
     return total / jnp.maximum(2 * jnp.sum(mask), 1).astype(total.dtype)

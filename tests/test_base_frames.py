@@ -68,7 +68,7 @@ def test_two_base_frames_are_the_trifocal_filter(seed):
         a, b = (np.asarray(ours[1])[pose], np.asarray(theirs.covariance)[pose])
         s = np.sqrt(np.diagonal(b, axis1=1, axis2=2))
         assert np.abs((a - b) / (s[:, :, None] * s[:, None])).max() < 0.5 * noise_px
-    assert apart[1] < 0.3 * apart[0] < 0.01
+    assert apart[1] < 0.2 * apart[0] < 0.01
 
 
 def test_the_measurement_is_that_of_the_trifocal_model():

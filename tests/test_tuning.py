@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from jaxlie import SE3
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
@@ -13,7 +14,7 @@ from jaxtri.tuning import Parameter
 
 
 class Walk(eqx.Module):
-    """A random walk on a line, seen by items that see it as it is; its first variance is a leaf, too."""
+    """A random walk on a line; an item measures it from an offset of its own."""
 
     sigma: Float[Array, ""]
     drift: Float[Array, ""]
@@ -89,6 +90,28 @@ def test_further_starts_do_no_worse_and_other_solvers_will_do():
     one = tuning.fit(MISTUNED, data, PARAMETERS, loss)
     more = tuning.fit(MISTUNED, data, PARAMETERS, loss, optx.NonlinearCG(1e-6, 1e-6), starts=3)
     assert more.loss_after < one.loss_after + 1e-5
+
+
+def test_losses_of_errors():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (6, 3)) + np.array([0, 0, 4])
+    seen = rng.uniform(size=(3, 6)) > 0.3
+    seen[1] = False
+    poses = SE3.exp(jnp.asarray(0.2 * rng.normal(size=(3, 6))))
+    X = np.einsum("tij,nj->tni", poses.rotation().as_matrix(), points) + np.asarray(poses.translation())[:, None]
+    observed = X[..., :2] / X[..., 2:] + 0.01 * rng.normal(size=(3, 6, 2))
+    expected = np.mean((X[..., :2] / X[..., 2:] - observed)[seen] ** 2)
+    junk = jnp.asarray(np.where(seen[..., None], observed, np.nan)), jnp.asarray(seen)
+    value, slope = jax.value_and_grad(lambda x: tuning.reprojection_loss(x, poses, *junk))(jnp.asarray(points))
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    assert np.isfinite(slope).all()
+    assert (np.any(slope, axis=1) == seen.any(axis=0)).all()
+
+    A = rng.normal(size=(3, 3))
+    errors = jnp.asarray(rng.normal(size=(20000, 3)) @ A.T)
+    covariance = jnp.broadcast_to(A @ A.T, (20000, 3, 3))
+    assert tuning.nees_loss(errors, covariance) < 1e-3
+    np.testing.assert_allclose(tuning.nees_loss(errors, 4 * covariance), np.log(4) ** 2, rtol=0.05)
 
 
 def test_what_cannot_be_fitted_is_named():

@@ -23,7 +23,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import schmidt
-from jaxtri.ekf import Diagnostics, Robust, unless_overflown
+from jaxtri.ekf import Diagnostics, Robust, regression, unless_overflown
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.geometry.pose import local, retract, shear
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, from_two_view, twist_noise
@@ -189,14 +189,7 @@ def release(model: BaseFrames, belief: Belief[BaseFramesState], slot: Int[Array,
     P = belief.covariance(Q)[12:, 12:]
     at = 6 * slot + jnp.arange(6)
     others = jnp.ones(b, dtype).at[at].set(0.0)
-    variance = jnp.diagonal(P)
-    s = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
-    scaled = P / jnp.outer(s, s)
-    # Any regression is right, its remainder being what it is; a ridge makes it one where P is singular.
-    ridge = 10 * b * jnp.finfo(dtype).eps
-    within = scaled * jnp.outer(others, others) + jnp.diag(ridge + (1 - others))
-    Phi = jnp.linalg.solve(within, (scaled[at] * others).T).T
-    Phi = jnp.where(variance[at, None] > 0, s[at, None] * Phi / s * others, 0.0)
+    Phi = regression(P * jnp.outer(others, others), P[:, at] * others[:, None])
     remainder = jnp.eye(b, dtype=dtype)[at] - Phi
     left = remainder @ P @ remainder.T
     onto = p.owed[:, :, at]
