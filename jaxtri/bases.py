@@ -1,7 +1,7 @@
 """The two ways to choose base frames, behind one interface for the driver: per track, or one pair for all."""
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple, Protocol
 
@@ -9,15 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxtri import segments, tracker
-from jaxtri.ekf import Diagnostics
-from jaxtri.geometry.epipolar import inverse_depth
 from jaxtri.geometry.pose import compose, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.tracker import Report, Settings, Status
-from jaxtri.two_view import TwoView, refine
+from jaxtri.two_view import TwoView
 from jaxtri.vision.initialise import Hypothesis, hypotheses
 
 
@@ -59,6 +57,7 @@ class Frame:
     visible: np.ndarray  # (n,)
     fresh: np.ndarray  # (n,)
     ids: np.ndarray  # (n,)
+    quality: np.ndarray  # (n, 2) forward-backward error in pixels, smaller eigenvalue of the patch
 
     def common(self, other: "Frame") -> np.ndarray:
         """Slots that hold the same track in both frames."""
@@ -69,16 +68,27 @@ _init = jax.jit(tracker.init)
 _step = jax.jit(tracker.step)
 _segment_init = jax.jit(segments.init)
 _segment_step = jax.jit(segments.step)
-_refine = jax.jit(refine)
-_depths = jax.jit(segments.depths)
-_common_scale = jax.jit(segments.common_scale)
+_consecutive = jax.jit(segments.consecutive)
+_inherited = jax.jit(segments.inherited)
+_second_report = jax.jit(segments.second_report)
 
 
 class Start(NamedTuple):
-    """A base pair, or the reason why there is none yet."""
+    """A base pair and the tracks that agree on it, or the reason why there is none yet."""
 
     pose: TwoView | None
     reason: str
+    inside: np.ndarray | None = None  # (n,)
+
+
+class Restart(NamedTuple):
+    """A base pair: its frames, the last one that the pair before it measured, and what its pose comes from."""
+
+    first: int
+    second: int
+    last: int
+    found: TwoView
+    inside: np.ndarray  # (n,)
 
 
 def find(settings: Settings, start: StartSettings, frames: list[Frame]) -> Start:
@@ -104,7 +114,7 @@ def find(settings: Settings, start: StartSettings, frames: list[Frame]) -> Start
         return Start(None, f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion")
     if not best.parallax_deg >= start.parallax_deg:
         return Start(None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed")
-    return Start(best.pose, "")
+    return Start(best.pose, "", best.inside)
 
 
 def _transfer_cost(settings: Settings, h: Hypothesis, first: Frame, last: Frame, between: list[Frame]) -> float:
@@ -152,8 +162,8 @@ def hold(
     settings: Settings, state: tracker.State, frame: Frame, visible: np.ndarray, dt: float
 ) -> tuple[tracker.State, Report]:
     """One frame measured with the tracks as they are: none begins, no keyframe is made."""
-    none = jnp.zeros(len(visible), bool)
-    return _step(settings, state, jnp.asarray(frame.u), jnp.asarray(visible), none, dt, hold=jnp.asarray(True))
+    arrays = jnp.asarray(frame.u), jnp.asarray(visible), jnp.zeros(len(visible), bool)
+    return _step(settings, state, *arrays, dt, hold=jnp.asarray(True), quality=jnp.asarray(frame.quality))
 
 
 @jax.jit
@@ -210,7 +220,7 @@ class Follower(Protocol):
         ...
 
     keyframes: int
-    restarts: int
+    begun: list[Restart]  # base pairs after the first, where one serves all tracks
 
     def follow(self, frame: Frame, dt: float) -> Report:
         """The pose of the next frame."""
@@ -230,7 +240,7 @@ class TrackPairs:
 
     def __init__(self, settings: Settings, state: tracker.State, last: Frame, common: np.ndarray) -> None:
         self.settings, self.state = settings, state
-        self.keyframes, self.restarts = 2, 0
+        self.keyframes, self.begun = 2, list[Restart]()
         self._known = np.where(common, last.ids, -1)
         self._structure = _Structure(settings)
 
@@ -253,6 +263,7 @@ class TrackPairs:
             jnp.asarray(fresh),
             dt,
             hold=jnp.asarray(False),
+            quality=jnp.asarray(frame.quality),
         )
         self.keyframes += int(report.keyframe)
         return report
@@ -283,7 +294,7 @@ class SinglePair:
         world: SE3,
     ) -> None:
         self.settings, self.start, self.base = settings, start, base
-        self.keyframes, self.restarts = 2, 0
+        self.keyframes, self.begun = 2, list[Restart]()
         self._structure = _Structure(settings)
         placement = segments.origin(settings.sigma.dtype)._replace(pose=world)
         self._history: deque[tuple[Frame, SE3, Array]] = deque(maxlen=40)
@@ -331,7 +342,7 @@ class SinglePair:
         over = np.asarray(self.state.inside) & (fresh | ~frame.visible)
         self._structure.end(self.state.structure, over, self._ids)
         arrays = jnp.asarray(frame.u), jnp.asarray(frame.visible), jnp.asarray(fresh)
-        self.state, report = _segment_step(self.settings, self.state, *arrays, dt)
+        self.state, report = _segment_step(self.settings, self.state, *arrays, dt, quality=jnp.asarray(frame.quality))
         self._history.append((frame, report.pose, report.covariance))
         return report
 
@@ -341,23 +352,19 @@ class SinglePair:
         first, pose1, covariance1 = known[0]
         frames = [k[0] for k in known[1:]] + [frame]
         second = frames[0]
-        found = find(self.settings, self.start, [first, second]).pose
-        if found is None:
+        found, _, inside = find(self.settings, self.start, [first, second])
+        if found is None or inside is None:
             return None  # go on with the old pair as long as it lasts
-        view = relative(self.state.placement.pose, pose1)
-        before, before_sd = _depths(self.state, view)
-        both = np.asarray(self.state.inside) & first.common(second) & (first.ids == self._ids)
-        one = _pair_depths(found, jnp.asarray(first.u), jnp.asarray(second.u))
-        scale, variance = _common_scale(before, before_sd, *one, jnp.asarray(both), self.settings.sigma)
-        if both.sum() < 3:
+        arrays = jnp.asarray(first.u), jnp.asarray(second.u)
+        common = jnp.asarray(first.common(second) & (first.ids == self._ids))
+        pair, placement, count = _consecutive(self.settings, self.state, found, *arrays, common, pose1, covariance1)
+        if count < 3:
             return None
         self._end()
-        old = self.state.placement.covariance
-        placement = segments.Placement(pose1, segments.place(covariance1, old[6, 6] + variance))
-        self._begin(first, second, scaled(found, scale), placement)
-        self.restarts += 1
+        self._begin(first, second, pair, placement)
+        self.begun.append(Restart(first.index, second.index, frame.index - 1, found, inside))
         self.keyframes += 2
-        report = _segment_report(self.state)
+        report = _second_report(self.state)
         self._history = deque(known[:1], maxlen=40)
         self._history.append((second, report.pose, report.covariance))
         for later in frames[1:]:
@@ -368,7 +375,7 @@ class SinglePair:
         """A new pair from two frames already tracked: the present one and the best of those before it."""
         *earlier, (now, pose, _) = self._history
         best, choice = 0.0, None
-        for frame, other, _ in earlier:
+        for frame, other, covariance in earlier:
             common = frame.common(now)
             if common.sum() < self.start.points:
                 continue
@@ -377,33 +384,17 @@ class SinglePair:
             # Information on depth: the angle, up to where more of it no longer helps, by the root of the count.
             score = min(angle, 3 * float(self.settings.fixed_parallax)) * np.sqrt(common.sum())
             if score > best:
-                best, choice = score, (frame, other)
+                best, choice = score, (frame, other, covariance)
         if choice is None:
             return
-        frame, other = choice
-        index = [h[0].index for h in self._history].index(frame.index)
-        earlier_covariance = self._history[index][2]
-        motion = relative(other, pose)
-        own = segments.own_covariance(self.state)
-        T = motion.translation()
-        refined = _refine(
-            T,
-            motion.rotation(),
-            jnp.asarray(frame.u),
-            jnp.asarray(now.u),
-            jnp.asarray(frame.common(now)),
-            self.settings.sigma,
-            prior=shear(-T) @ (own + 1e-12 * jnp.eye(6, dtype=own.dtype)) @ shear(-T).T,
-        )
+        frame, other, covariance = choice
+        arrays = jnp.asarray(frame.u), jnp.asarray(now.u), jnp.asarray(frame.common(now))
+        refined, placement = _inherited(self.settings, self.state, *arrays, other, covariance)
         if not bool(refined.converged):
             return
         self._end()
-        direction = T / jnp.linalg.norm(T)
-        length_variance = direction @ own[:3, :3] @ direction / (T @ T)
-        old = self.state.placement.covariance
-        placement = segments.Placement(other, segments.place(earlier_covariance, old[6, 6] + length_variance))
         self._begin(frame, now, refined, placement)
-        self.restarts += 1
+        self.begun.append(Restart(frame.index, now.index, now.index, refined, frame.common(now)))
         self.keyframes += 1
 
     def ended(self) -> list[Points]:
@@ -415,47 +406,7 @@ class SinglePair:
         return self._structure.of(self.state.structure, np.asarray(self.state.inside), self._ids)
 
 
-@jax.jit
-def _segment_report(state: segments.State) -> Report:
-    """What a new segment says of its second base frame, which no update has measured."""
-    inside = state.inside
-    nothing = jnp.zeros(inside.shape, state.pairs.dtype)
-    unknown = jnp.full((), jnp.nan, state.pairs.dtype)
-    diagnostics = Diagnostics(unknown, unknown, jnp.sum(inside), inside.astype(nothing.dtype), nothing)
-    pose, covariance = segments.world_pose(state)
-    return Report(
-        pose,
-        covariance,
-        jnp.asarray(int(Status.TRACKING)),
-        jnp.asarray(True),
-        jnp.zeros_like(inside),
-        diagnostics,
-    )
-
-
-@jax.jit
-def _pair_depths(
-    two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"]
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Depths in the first view, and the standard deviation of their logarithms in units of sigma."""
-    R, T = two_view.rotation.as_matrix(), two_view.translation
-
-    def one(a: Array, b: Array) -> tuple[Array, Array]:
-        value, (da, db) = jax.value_and_grad(inverse_depth, argnums=(0, 1))(a, b, R, T, T)
-        safe = jnp.where(value > 1e-9, value, 1e-9)
-        return jnp.where(value > 1e-9, 1 / safe, 0.0), jnp.sqrt(jnp.sum(da**2) + jnp.sum(db**2)) / safe
-
-    return jax.vmap(one)(first, second)
-
-
 def _parallax(a: np.ndarray, b: np.ndarray, R: np.ndarray) -> float:
     x = np.c_[a, np.ones(len(a))] @ R.T
     y = np.c_[b, np.ones(len(b))]
     return float(np.median(np.arctan2(np.linalg.norm(np.cross(x, y), axis=1), (x * y).sum(axis=1))))
-
-
-def scaled(two_view: TwoView, length: Float[Array, ""] | float) -> TwoView:
-    """The same relative pose with its translation multiplied by `length`."""
-    C = two_view.covariance
-    s = jnp.concatenate([jnp.full(3, length, C.dtype), jnp.ones(3, C.dtype)])
-    return replace(two_view, translation=two_view.translation * length, covariance=C * jnp.outer(s, s))

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxtri.scan import checkpointed
+
 Mean = TypeVar("Mean")
 Taken = TypeVar("Taken", bound=PyTree)
 
@@ -61,8 +63,8 @@ class Model(Dynamics[Mean], Protocol[Mean]):
         ...
 
 
-def _number(x: Array | float) -> Array:
-    # Of a definite dtype: a weakly typed leaf would compile once more than a plain one.
+def number(x: Array | float) -> Array:
+    """A leaf of a definite dtype: a weakly typed one would compile once more than a plain one."""
     return x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.result_type(float))
 
 
@@ -76,9 +78,9 @@ class Robust(eqx.Module):
     higher `start` survives a worse prediction and needs more passes: 1e5 nine, 1e7 about sixteen.
     """
 
-    start: Float[Array, ""] = eqx.field(default=1e5, converter=_number)
-    scale: Float[Array, ""] = eqx.field(default=16.0, converter=_number)
-    gate: Float[Array, ""] = eqx.field(default=13.8, converter=_number)
+    start: Float[Array, ""] = eqx.field(default=1e5, converter=number)
+    scale: Float[Array, ""] = eqx.field(default=16.0, converter=number)
+    gate: Float[Array, ""] = eqx.field(default=13.8, converter=number)
 
     def weights(self, distance: Float[Array, " n"], k: Int[Array, ""], passes: int) -> Float[Array, " n"]:
         """Weights in pass k of `passes`, of items whose squared Mahalanobis distance is given."""
@@ -92,9 +94,10 @@ class Diagnostics(eqx.Module):
     """What an update reports beside the belief.
 
     `log_likelihood` of the innovations and `nis`, the normalised innovation squared (chi-square with
-    `used * m` degrees of freedom for a consistent filter), are taken at the last linearisation; with robust
-    weights both are those of the weighted items, the gated ones left out. `distance` is m2 of every item
-    after the update under the measurement noise alone (zero where masked).
+    `used * m` degrees of freedom for a consistent filter), are taken at the last linearisation: Laplace's
+    approximation, exact for one pass of a linear model. After robust weights both are those of the `used` items,
+    each counted in full, about the robust estimate; of the `measured` ones the gate has left out the others.
+    `distance` is m2 of every item after the update under the measurement noise alone (zero where masked).
 
     An update that overflows, as that of a filter which has long lost the track may, is not taken: the belief
     stays as predicted, `used` is zero and `log_likelihood` minus infinity.
@@ -102,6 +105,7 @@ class Diagnostics(eqx.Module):
 
     log_likelihood: Float[Array, ""]
     nis: Float[Array, ""]
+    measured: Int[Array, ""]
     used: Int[Array, ""]
     weights: Float[Array, " n"]
     distance: Float[Array, " n"]
@@ -153,7 +157,9 @@ def stand_in(mask: Bool[Array, " n"], items: PyTree) -> PyTree:
     return jax.tree.map(replace, items)
 
 
-def _linearise(model: Model, prior: Any, delta: Array, items: PyTree, observed: Array, mask: Array) -> _Linearisation:
+def _linearise(
+    model: Model, prior: Any, delta: Array, items: PyTree, observed: Array, mask: Array, scale: Array | None
+) -> _Linearisation:
     """Residual, Jacobian with respect to the error of the *prior*, and noise, at `retract(prior, delta)`."""
 
     def predicted(error: Array) -> Array:
@@ -164,6 +170,8 @@ def _linearise(model: Model, prior: Any, delta: Array, items: PyTree, observed: 
     columns = jax.vmap(push, out_axes=-1)(jnp.eye(delta.size, dtype=delta.dtype))
     mean = model.retract(prior, delta)
     noise = jax.vmap(lambda item: model.noise(mean, item))(items)
+    if scale is not None:
+        noise = noise * jnp.square(scale)[:, None, None]
     whitener, log_det = jax.vmap(whiten)(noise)
     whitened = replace_masked(mask, (observed - h, columns, whitener, log_det), 0.0)
     return _Linearisation(*whitened)
@@ -267,17 +275,18 @@ def information(
     mean: Mean,
     items: PyTree[Array],
     weights: Float[Array, " n"],
+    noise_scale: Float[Array, " n"] | None = None,
 ) -> tuple[Float[Array, "d d"], Float[Array, "n d m"]]:
     """What the items say of the error at `mean`: A = sum w H' D^-1 H, and w H' D^-1 of each.
 
     `P @ (w H' D^-1)` is an item's share of the gain of an update whose posterior covariance is P. Items of
-    weight zero count nothing.
+    weight zero count nothing. `noise_scale` as of `update`.
     """
     mask = weights > 0
-    items = stand_in(mask, items)
+    items, noise_scale = stand_in(mask, items), stand_in(mask, noise_scale)
     observed = jax.vmap(lambda item: model.measure(mean, item))(items)
     d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
-    lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask)
+    lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask, noise_scale)
     A, _ = _normal_equations(lin, weights, jnp.zeros(d, weights.dtype))
     whitened = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian)
     return A, jnp.einsum("n,nid,nij->ndj", weights, whitened, lin.whitener)
@@ -300,16 +309,18 @@ def update(
     *,
     passes: int = 4,
     robust: Robust | None = None,
+    noise_scale: Float[Array, " n"] | None = None,
 ) -> tuple[Belief[Mean], Diagnostics]:
     """The belief after the measurements of one frame.
 
     `items` is what `model.measure` takes, with a leading axis n; `mask` False leaves an item out. `passes`
     counts the linearisations (Gauss-Newton on the posterior, Bell & Cathey 1993): one is the plain EKF.
-    With `robust`, the passes before the last bring the weights down; eight or nine are needed.
+    With `robust`, the passes before the last bring the weights down; eight or nine are needed. `noise_scale` is the
+    standard deviation of each item's noise over what the model says, where something more is known of it.
     """
     P, prior = belief.covariance, belief.mean
     dtype = P.dtype
-    items = stand_in(mask, items)
+    items, noise_scale = stand_in(mask, items), stand_in(mask, noise_scale)
     observed = replace_masked(mask, observed, 0.0)
     valid = mask.astype(dtype)
 
@@ -322,13 +333,13 @@ def update(
         return error if considered is None else jnp.where(considered, 0.0, error)
 
     def iterate(k: Array, delta: Array) -> Array:
-        lin = _linearise(model, prior, delta, items, observed, mask)
+        lin = _linearise(model, prior, delta, items, observed, mask, noise_scale)
         A, b = _normal_equations(lin, weigh(lin, k), delta)
         return correct(posterior_error(P, A, b))
 
     # A loop, not an unrolled chain: unrolling multiplies the compile time by the number of passes.
     delta = jax.lax.fori_loop(0, passes - 1, iterate, jnp.zeros(P.shape[0], dtype))
-    lin = _linearise(model, prior, delta, items, observed, mask)
+    lin = _linearise(model, prior, delta, items, observed, mask, noise_scale)
     weights = weigh(lin, jnp.asarray(passes - 1))
     used = mask
     if robust is not None:
@@ -347,7 +358,7 @@ def update(
     posterior = Belief(mean, reset @ covariance @ reset.T)
 
     # nu' S^-1 nu and log det S without S: by the solution's own normal equations, free of cancellation.
-    quadratic = jnp.sum(weights * _distance(_moved(lin, optimal - delta)))
+    quadratic = jnp.sum(jnp.where(used, _distance(_moved(lin, optimal - delta)), 0.0))
     nis = quadratic + optimal @ (b - A @ optimal)
     log_det = log_det + jnp.sum(jnp.where(used, lin.log_det, 0.0))
     m = observed.shape[-1]
@@ -355,6 +366,7 @@ def update(
     diagnostics = Diagnostics(
         log_likelihood=-(nis + log_det + constant) / 2,
         nis=nis,
+        measured=jnp.sum(mask),
         used=jnp.sum(used),
         weights=weights,
         distance=_distance(_moved(lin, final - delta)),
@@ -387,11 +399,13 @@ def filter(
     *,
     passes: int = 4,
     robust: Robust | None = None,
+    block: int = 1,
 ) -> tuple[Belief[Mean], Diagnostics]:
     """Beliefs and diagnostics of all frames, stacked along a leading axis t.
 
     `belief` stands before the first frame, which is predicted to. `items` are the same in every frame;
-    `dt` is one per frame, 1 by default.
+    `dt` is one per frame, 1 by default. A reverse gradient keeps a belief a frame; of a long sequence, with
+    `block`, one in every `block` frames: `jaxtri.scan`.
     """
     if dt is None:
         dt = jnp.ones(observed.shape[0], belief.covariance.dtype)
@@ -402,7 +416,7 @@ def filter(
         return carry, (carry, diagnostics)
 
     # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.
-    return jax.lax.scan(jax.checkpoint(body), belief, (observed, mask, dt))[1]
+    return checkpointed(body, belief, (observed, mask, dt), block)[1]
 
 
 def smooth(model: Dynamics[Mean], beliefs: Belief[Mean], dt: Float[Array, " t"] | None = None) -> Belief[Mean]:

@@ -10,26 +10,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxlie import SE3
+from jaxlie import SE3, SO3
 
 from jaxtri.bases import (
     Base,
     Follower,
     Frame,
     Points,
+    Restart,
     SinglePair,
     StartSettings,
     TrackPairs,
     fill,
     find,
     hold,
-    scaled,
 )
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.geometry.camera import Camera
+from jaxtri.replay import Recording
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.trajectory import Trajectory
-from jaxtri.two_view import TwoView
+from jaxtri.two_view import TwoView, scaled
 from jaxtri.vision.klt import FrameTracks
 
 
@@ -75,6 +76,7 @@ class Odometry:
     base: Base = Base.TRACKS
     start: StartSettings | None = None
     frame_time: float | None = None  # seconds of one frame; the first interval by default
+    record: bool = False  # keep the tracks, for `recording`
 
     poses: list[FramePose] = field(default_factory=list, init=False)
     base_pair: tuple[int, int] | None = field(default=None, init=False)  # frames of the first start
@@ -94,6 +96,10 @@ class Odometry:
         self._tried = (-1, 0.0)
         self._depth = 1.0
         self._changes = 0
+        self._recording = self.record  # up to where the camera is lost
+        self._tracks: list[FrameTracks] = []
+        self._begun: list[Restart] = []
+        self._begun_later: list[Restart] = []
 
     def add(self, tracks: FrameTracks, time: float) -> np.ndarray:
         """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
@@ -107,6 +113,8 @@ class Odometry:
         if self.frame_time is None and self.poses:
             self.frame_time = time - self.poses[-1].time
         frame = self._frame(index, tracks, time)
+        if self._recording:
+            self._tracks.append(tracks._replace(visible=frame.visible))
         self.poses.append(FramePose(time, Status.LOST if self.segments else Status.INITIALISING))
         if self._follower is None:
             self._waiting.append(frame)
@@ -132,7 +140,7 @@ class Odometry:
     @property
     def changes(self) -> int:
         """How often the single pair was replaced (inherit, paper)."""
-        return self._changes + (0 if self._follower is None else self._follower.restarts)
+        return self._changes + (0 if self._follower is None else len(self._follower.begun))
 
     def trajectory(self) -> Trajectory:
         """The trajectory so far, camera to world; a frame without a pose repeats its neighbour's, by its status.
@@ -172,12 +180,48 @@ class Odometry:
         xyz, covariance = (np.stack([known[i][k] for i in ids]) for k in (0, 1))
         return Points(ids, xyz, covariance)
 
+    def recording(self) -> Recording:
+        """The tracks and base pairs so far, up to where the camera is lost, for `jaxtri.replay`.
+
+        Raises `InputError` where `record` is off, `InitialisationError` where there is no start yet.
+        """
+        if not self.record:
+            raise InputError("nothing was recorded: ask for it by record=True")
+        if not self._begun:
+            raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
+        origin, dtype = self._begun[0].first, self._settings.sigma.dtype
+        kept, pairs = self._tracks[origin:], [*self._begun, *self._begun_later]
+        ends = [*(p.last for p in pairs[1:]), origin + len(kept) - 1]
+        measured = [np.arange(p.second + 1, end + 1) - origin for p, end in zip(pairs, ends, strict=True)]
+        frames = np.full((len(pairs), max(1, *map(len, measured))), -1)
+        for row, those in zip(frames, measured, strict=True):
+            row[: len(those)] = those
+        visible = np.stack([t.visible for t in kept])
+        pixels = np.where(visible[..., None], np.stack([t.pixels for t in kept]), 0.0)
+        quality = np.stack([np.stack([t.error, t.eigenvalue], axis=1) for t in kept])
+        return Recording(
+            jnp.asarray(pixels, dtype),
+            jnp.asarray(visible),
+            jnp.asarray(np.stack([t.ids for t in kept])),
+            jnp.asarray(quality, dtype),
+            jnp.asarray([self._dt(origin + k) for k in range(len(kept))], dtype),
+            jnp.asarray([p.first - origin for p in pairs]),
+            jnp.asarray([p.second - origin for p in pairs]),
+            jnp.asarray(frames),
+            jnp.stack([p.found.translation for p in pairs]),
+            SO3(jnp.stack([p.found.rotation.wxyz for p in pairs])),
+            jnp.asarray(np.stack([p.inside for p in pairs])),
+            inherit=self.base is Base.INHERIT,
+        )
+
     def _frame(self, index: int, tracks: FrameTracks, time: float) -> Frame:
         visible = np.asarray(tracks.visible, bool) & np.isfinite(tracks.pixels).all(axis=1)
         pixels = jnp.asarray(np.where(visible[:, None], tracks.pixels, 0.0), self._settings.sigma.dtype)
         u = np.asarray(_normalise(self.camera, pixels))
         visible &= np.isfinite(u).all(axis=1)
-        return Frame(index, time, u, visible, np.asarray(tracks.fresh, bool) & visible, np.array(tracks.ids))
+        fresh = np.asarray(tracks.fresh, bool) & visible
+        quality = np.stack([tracks.error, tracks.eigenvalue], axis=1).astype(u.dtype)
+        return Frame(index, time, u, visible, fresh, np.array(tracks.ids), quality)
 
     def _dt(self, index: int) -> float:
         if index == 0 or not self.frame_time:
@@ -226,10 +270,10 @@ class Odometry:
         self._tried = (first.index, flow)
         found = find(self._settings, self._start, self._waiting)
         self.reason = found.reason
-        if found.pose is not None:
-            self._begin(self._waiting, found.pose)
+        if found.pose is not None and found.inside is not None:
+            self._begin(self._waiting, found.pose, found.inside)
 
-    def _begin(self, frames: list[Frame], pose: TwoView) -> None:
+    def _begin(self, frames: list[Frame], pose: TwoView, inside: np.ndarray) -> None:
         """Set up the filter from a base pair, and fill in the frames between and before."""
         first, last = frames[0], frames[-1]
         again = self.segments > 0
@@ -242,6 +286,7 @@ class Odometry:
             self.scale_unknown_from = self.scale_unknown_from or first.index
         else:
             self.base_pair = (first.index, last.index)
+            self._begun = [Restart(first.index, last.index, first.index, pose, inside)]
         state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
         self._record(first, world, None, Status.RESTARTED if again else Status.TRACKING)
         for frame, report in [*reports, *self._backwards(first, state, world)]:
@@ -250,6 +295,8 @@ class Odometry:
             self._follower = TrackPairs(self._settings, state, last, first.common(last))
         else:
             self._follower = SinglePair(self._settings, self._start, self.base, frames, pose, world)
+        if not again:
+            self._begun_later = self._follower.begun
         self.segments += 1
         self._waiting, self._passed = [], []
 
@@ -268,7 +315,8 @@ class Odometry:
     def _lose(self, frame: Frame) -> None:
         """The camera is lost: start again from here."""
         assert self._follower is not None
-        self._changes += self._follower.restarts
+        self._changes += len(self._follower.begun)
+        self._recording = False
         self._depth = self._follower.depth
         _keep(self._points, self._follower.present())
         self._follower = None

@@ -47,14 +47,16 @@ def track(
     klt: KLTSettings | None = None,
     progress: bool = True,
     max_frames: int | None = None,
+    record: bool = False,
 ) -> Run:
     """Recover the camera's trajectory from the frames of a source, one pass, in order.
 
+    With `record` the run can be differentiated: `run.odometry.recording()` and `jaxtri.replay`.
     An interrupt (Ctrl-C) ends the sequence there; what was tracked so far is kept. Raises
     `InitialisationError` where the camera never moved enough, `CameraError` where the frames are not of the
     size the camera was calibrated for, `InputError` on fewer than two frames, and what the source raises.
     """
-    follower, tracker = KLT(klt or KLTSettings()), Odometry(camera, settings, base, start)
+    follower, tracker = KLT(klt or KLTSettings()), Odometry(camera, settings, base, start, record=record)
     colours: dict[int, np.ndarray] = {}
     seconds = {"decoding": 0.0, "optical flow": 0.0, "filter": 0.0}
     declared = source.declared if isinstance(source, FrameSource) else None
@@ -127,6 +129,7 @@ def follow_tracks(
     base: Base = Base.TRACKS,
     settings: Settings | None = None,
     start: StartSettings | None = None,
+    record: bool = False,
 ) -> Odometry:
     """The same from feature tracks: `pixels` (t, n, 2) and `visible` (t, n), a column a track.
 
@@ -135,11 +138,11 @@ def follow_tracks(
     if pixels.ndim != 3 or pixels.shape[2] != 2 or visible.shape != pixels.shape[:2]:
         raise InputError(f"tracks of shape {pixels.shape} with visible {visible.shape}: give (t, n, 2) and (t, n)")
     times = np.arange(len(pixels), dtype=float) if times is None else times
-    odometry = Odometry(camera, settings, base, start)
-    ids, nothing = np.arange(pixels.shape[1]), np.zeros(pixels.shape[1])
+    odometry = Odometry(camera, settings, base, start, record=record)
+    ids, unknown = np.arange(pixels.shape[1]), np.full(pixels.shape[1], np.nan)
     before = np.zeros(pixels.shape[1], bool)
     for t, (z, seen) in enumerate(zip(pixels, visible, strict=True)):
-        odometry.add(FrameTracks(z, seen, seen & ~before, ids, nothing), float(times[t]))
+        odometry.add(FrameTracks(z, seen, seen & ~before, ids, unknown, unknown), float(times[t]))
         before = seen
     return odometry
 

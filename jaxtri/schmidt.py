@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxtri import ekf
 from jaxtri.ekf import Diagnostics, Robust
+from jaxtri.scan import checkpointed
 
 Mean = TypeVar("Mean")
 
@@ -238,12 +239,15 @@ def update(
     log_det = jnp.linalg.slogdet(inner)[1] + jnp.sum(jnp.where(used, lin.log_det, 0.0))
     constant = observed.shape[1] * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
     left = lin.innovation - jnp.einsum("nmd,d->nm", lin.at.jacobian, e)
+    distance = jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1)
+    nis = nis + jnp.sum(jnp.where(used, 1 - weights, 0.0) * distance)  # every item that is used counts in full
     diagnostics = Diagnostics(
         log_likelihood=-(nis + log_det + constant) / 2,
         nis=nis,
+        measured=jnp.sum(mask),
         used=jnp.sum(used),
         weights=weights,
-        distance=jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1),
+        distance=distance,
     )
     posterior, diagnostics, finite = ekf.unless_overflown(belief, posterior, diagnostics)
     moved, gain = ekf.replace_masked(absorbed, (said.moved, said.gain), 0.0)
@@ -275,16 +279,15 @@ def filter(
     *,
     passes: int = 4,
     robust: Robust | None = None,
+    block: int = 1,
 ) -> tuple[ekf.Belief[Mean], Diagnostics]:
     """Beliefs, with their whole covariance, and diagnostics of all frames: as `jaxtri.ekf.filter`."""
     if dt is None:
         dt = jnp.ones(observed.shape[0], belief.own.dtype)
 
-    # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.
-    @jax.checkpoint
     def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
         z, seen, elapsed = frame
         carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
         return carry, (total(model, carry, items), diagnostics)
 
-    return jax.lax.scan(body, belief, (observed, mask, dt))[1]
+    return checkpointed(body, belief, (observed, mask, dt), block)[1]

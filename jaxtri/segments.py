@@ -15,11 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import adjoint, multiply
+from jaxtri.geometry.pose import adjoint, multiply, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
-from jaxtri.tracker import Report, Settings, judge, median, structure_model
-from jaxtri.two_view import TwoView
+from jaxtri.tracker import Report, Settings, Status, judge, median, noise_scale, structure_model
+from jaxtri.two_view import TwoView, refine, scaled
 
 
 class Placement(NamedTuple):
@@ -105,13 +105,23 @@ def step(
     visible: Bool[Array, " n"],
     fresh: Bool[Array, " n"],
     dt: Float[Array, ""] | float = 1.0,
+    *,
+    quality: Float[Array, "n 2"] | None = None,
 ) -> tuple[State, Report]:
     """One frame: predict, and update with the tracks of the base pair that are still there."""
     inside = state.inside & visible & ~fresh
     model = _model(settings, state.epipole, state.depth)
     predicted = ekf.predict(model, state.belief, dt)
+    scale = noise_scale(settings, quality)
     updated, diagnostics = ekf.update(
-        model, predicted, state.pairs, observed, inside, passes=settings.passes, robust=settings.robust
+        model,
+        predicted,
+        state.pairs,
+        observed,
+        inside,
+        passes=settings.passes,
+        robust=settings.robust,
+        noise_scale=scale,
     )
     belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, inside, state.coasted)
     drop = ok & inside & (diagnostics.distance > settings.outlier)
@@ -146,6 +156,20 @@ def depths(state: State, view: SE3) -> tuple[Float[Array, " n"], Float[Array, " 
     return jax.vmap(one)(state.pairs)
 
 
+def pair_depths(
+    two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Depths in the first view, and the standard deviation of their logarithms in units of sigma."""
+    R, T = two_view.rotation.as_matrix(), two_view.translation
+
+    def one(a: Array, b: Array) -> tuple[Array, Array]:
+        value, (da, db) = jax.value_and_grad(inverse_depth, argnums=(0, 1))(a, b, R, T, T)
+        safe = jnp.where(value > 1e-9, value, 1e-9)
+        return jnp.where(value > 1e-9, 1 / safe, 0.0), safe_norm(jnp.concatenate([da, db])) / safe
+
+    return jax.vmap(one)(first, second)
+
+
 def common_scale(
     before: Float[Array, " n"],
     before_sd: Float[Array, " n"],
@@ -169,3 +193,57 @@ def common_scale(
     expected = 1 / jnp.maximum(total[-1], 1e-12)
     spread = jnp.sum(weight * (ratio - jnp.log(scale)) ** 2) / jnp.maximum(jnp.sum(good), 1)
     return scale, jnp.pi / 2 * expected * jnp.maximum(spread, 1.0)
+
+
+def consecutive(
+    settings: Settings,
+    state: State,
+    found: TwoView,
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    common: Bool[Array, " n"],
+    pose: SE3,
+    covariance: Float[Array, "6 6"],
+) -> tuple[TwoView, Placement, Int[Array, ""]]:
+    """The paper's hand-over, to a pair that `found` relates: its scale is that of the points both segments know.
+
+    `pose` and `covariance` are those of the pair's first frame in the segment that ends. Also the number of points
+    that decide on the scale: fewer than three do not.
+    """
+    mask = state.inside & common
+    before = depths(state, relative(state.placement.pose, pose))
+    scale, variance = common_scale(*before, *pair_depths(found, first, second), mask, settings.sigma)
+    log_scale = state.placement.covariance[6, 6] + variance
+    return scaled(found, scale), Placement(pose, place(covariance, log_scale)), jnp.sum(mask)
+
+
+def inherited(
+    settings: Settings,
+    state: State,
+    first: Float[Array, "n 2"],
+    second: Float[Array, "n 2"],
+    common: Bool[Array, " n"],
+    pose: SE3,
+    covariance: Float[Array, "6 6"],
+) -> tuple[TwoView, Placement]:
+    """The hand-over to a pair of a frame already tracked and the present one: their relative pose is the prior.
+
+    `pose` and `covariance` are those of the pair's first frame.
+    """
+    motion, own = relative(pose, world_pose(state)[0]), own_covariance(state)
+    T = motion.translation()
+    prior = shear(-T) @ (own + 1e-12 * jnp.eye(6, dtype=own.dtype)) @ shear(-T).T
+    refined = refine(T, motion.rotation(), first, second, common, settings.sigma, prior=prior)
+    direction = T / safe_norm(T)
+    log_scale = state.placement.covariance[6, 6] + direction @ own[:3, :3] @ direction / (T @ T)
+    return refined, Placement(pose, place(covariance, log_scale))
+
+
+def second_report(state: State) -> Report:
+    """What a new segment says of its second base frame, which no update has measured."""
+    inside = state.inside
+    nothing = jnp.zeros(inside.shape, state.pairs.dtype)
+    unknown, count = jnp.full((), jnp.nan, nothing.dtype), jnp.sum(inside)
+    diagnostics = ekf.Diagnostics(unknown, unknown, count, count, inside.astype(nothing.dtype), nothing)
+    status = jnp.asarray(int(Status.TRACKING))
+    return Report(*world_pose(state), status, jnp.asarray(True), jnp.zeros_like(inside), diagnostics)

@@ -25,6 +25,8 @@ from jaxtri.keyframes import Keyframes, add, carry, start, total
 from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_point
 from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Twist
+from jaxtri.models.point_noise import PointNoise
+from jaxtri.scan import checkpointed
 
 
 class Status(IntEnum):
@@ -56,10 +58,11 @@ class Settings(eqx.Module):
     minimum: Float[Array, ""]  # fewest agreeing points of a pose
     patience: Float[Array, ""]  # frames of coasting after which the camera is lost
     robust: ekf.Robust
+    point_noise: PointNoise | None = None  # of a point over sigma
     passes: int = eqx.field(static=True, default=8)
 
     @classmethod
-    def of(cls, camera: Camera, *, noise_px: float = 0.4, passes: int = 8) -> "Settings":
+    def of(cls, camera: Camera, *, noise_px: Float[Array, ""] | float = 0.4, passes: int = 8) -> "Settings":
         """The defaults, for a camera whose tracks have `noise_px` of noise in each coordinate."""
         focal = jnp.sqrt(camera.fx * camera.fy)
         width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
@@ -125,6 +128,11 @@ class Report(NamedTuple):
 def structure_model(settings: Settings) -> Depth:
     """The filters of the points, which are gated as the pose's are."""
     return Depth.of(settings.sigma, gate=settings.robust.gate)
+
+
+def noise_scale(settings: Settings, quality: Float[Array, "n 2"] | None) -> Float[Array, " n"] | None:
+    """Noise of each point over sigma, where the settings have a model of it."""
+    return None if quality is None or settings.point_noise is None else settings.point_noise.scale(quality)
 
 
 def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
@@ -249,12 +257,13 @@ def step(
     dt: Float[Array, ""] | float = 1.0,
     *,
     hold: Bool[Array, ""] | bool = False,
+    quality: Float[Array, "n 2"] | None = None,
 ) -> tuple[State, Report]:
     """One frame: predict, update with the tracks that have a base pair, keep a keyframe when it is time.
 
     `observed` are normalised points in slots, `visible` the slots that hold one, `fresh` those whose track
-    begins here (whatever the slot held before is forgotten). `hold` makes no keyframe. Where too few points
-    agree the state is the prediction and the status says so.
+    begins here (whatever the slot held before is forgotten). `hold` makes no keyframe. `quality` is what
+    `settings.point_noise` asks for. Where too few points agree the state is the prediction and the status says so.
     """
     observed = jnp.where(visible[:, None], observed, jnp.zeros((), observed.dtype))
     old = state.tracks
@@ -263,14 +272,14 @@ def step(
 
     model = _model(settings, state.depth)
     predicted = ekf.predict(model, state.belief, dt)
-    mask = tracks.usable
+    mask, scale = tracks.usable, noise_scale(settings, quality)
     updated, diagnostics = ekf.update(
-        model, predicted, tracks.base, observed, mask, passes=settings.passes, robust=settings.robust
+        model, predicted, tracks.base, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
     )
     dt = jnp.asarray(dt, observed.dtype)
     belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, mask, state.coasted)
     drop = ok & mask & (diagnostics.distance > settings.outlier)
-    A, gains = ekf.information(model, belief.mean, tracks.base, jnp.where(ok, diagnostics.weights, 0.0))
+    A, gains = ekf.information(model, belief.mean, tracks.base, jnp.where(ok, diagnostics.weights, 0.0), scale)
     levers = jax.vmap(lambda item, lever: model.lever(belief.mean, item, lever))(tracks.base, tracks.lever)
     levers = jnp.where(mask[:, None, None], levers, 0.0)
     F = ekf.transition(model, state.belief.mean, dt)
@@ -317,13 +326,22 @@ def filter(
     visible: Bool[Array, "t n"],
     fresh: Bool[Array, "t n"],
     dt: Float[Array, " t"] | None = None,
+    *,
+    hold: Bool[Array, " t"] | None = None,
+    quality: Float[Array, "t n 2"] | None = None,
+    block: int = 1,
 ) -> tuple[State, Report]:
-    """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan."""
+    """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan.
+
+    A reverse gradient keeps one state a frame, or one in every `block` frames: `jaxtri.scan`.
+    """
     if dt is None:
         dt = jnp.ones(observed.shape[0], observed.dtype)
+    if hold is None:
+        hold = jnp.zeros(observed.shape[0], bool)
 
-    @jax.checkpoint  # a reverse gradient keeps one state a frame, not every intermediate of every pass
     def body(carry: State, frame: tuple) -> tuple[State, Report]:
-        return step(settings, carry, *frame)
+        *arguments, held, known = frame
+        return step(settings, carry, *arguments, hold=held, quality=known)
 
-    return jax.lax.scan(body, state, (observed, visible, fresh, dt))
+    return checkpointed(body, state, (observed, visible, fresh, dt, hold, quality), block)

@@ -91,8 +91,11 @@ def fit(
     for up to four numbers and in reverse for more, or as `forward` says. Losses should be of order one, a mean
     over the data, for the first step to be of a sensible length. Host only.
 
-    Raises `InputError` where a parameter cannot be fitted as it stands or the loss at the start is not finite.
+    Raises `InputError` where a parameter cannot be fitted as it stands, or where the loss at the start is not finite
+    or does not depend on any parameter.
     """
+    if not parameters or starts < 1:
+        raise InputError(f"{len(parameters)} parameters and {starts} starts: a fit wants at least one of each")
     leaves = {name: jnp.asarray(p.where(model)) for name, p in parameters.items()}
     for name, p in parameters.items():
         if p.log and not bool(jnp.all(leaves[name] > p.floor)):
@@ -148,21 +151,26 @@ def fit(
     return Fit(fitted, converged, before, best, int(found.stats["num_steps"]), changes)
 
 
-def negative_log_likelihood(diagnostics: Diagnostics, components: int = 2) -> Float[Array, ""]:
-    """Of the innovations of a whole run, per component of a used measurement; infinite where an update was refused.
+def negative_log_likelihood(
+    diagnostics: Diagnostics, components: int = 2, outlier: Float[Array, ""] | float = 0.0
+) -> Float[Array, ""]:
+    """Of the innovations of a whole run, per component of a measurement; infinite where an update was refused.
 
-    Of iterated updates it is Laplace's approximation, taken at the last linearisation.
+    Of iterated and robust updates it is Laplace's approximation: see `Diagnostics`. What a robust gate leaves out
+    counts with the logarithm of a density of its own, `outlier`, lest a fit gain by leaving out what it explains
+    badly; zero is one outlier evenly over an image of one normalised unit by one. Of a run over recorded video take
+    `jaxtri.replay.negative_log_likelihood`.
     """
-    return -_per_component(diagnostics.log_likelihood, diagnostics, components)
+    count = jnp.maximum(jnp.sum(diagnostics.measured), 1)
+    outside = jnp.sum(diagnostics.measured - diagnostics.used) * outlier
+    return -(jnp.sum(diagnostics.log_likelihood) + outside) / (components * count)
 
 
 def nis_per_component(diagnostics: Diagnostics, components: int = 2) -> Float[Array, ""]:
     """Normalised innovation squared of a whole run over its degrees of freedom: 1 is right."""
-    return _per_component(diagnostics.nis, diagnostics, components)
-
-
-def _per_component(x: Float[Array, " t"], diagnostics: Diagnostics, components: int) -> Float[Array, ""]:
-    return jnp.sum(x) / (components * jnp.maximum(jnp.sum(diagnostics.used), 1)).astype(x.dtype)
+    return jnp.sum(diagnostics.nis) / (components * jnp.maximum(jnp.sum(diagnostics.used), 1)).astype(
+        diagnostics.nis.dtype
+    )
 
 
 def nees_loss(errors: Float[Array, "*batch d"], covariance: Float[Array, "*batch d d"]) -> Float[Array, ""]:

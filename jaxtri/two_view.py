@@ -1,5 +1,7 @@
 """Maximum-likelihood pose of two views, with its covariance: the initial belief of every filter here."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,13 @@ class TwoView(eqx.Module):
     covariance: Float[Array, "6 6"]
     rms: Float[Array, ""]
     converged: Bool[Array, ""]
+
+
+def scaled(two_view: TwoView, length: Float[Array, ""] | float) -> TwoView:
+    """The same relative pose with its translation multiplied by `length`."""
+    C = two_view.covariance
+    s = jnp.concatenate([jnp.full(3, length, C.dtype), jnp.ones(3, C.dtype)])
+    return replace(two_view, translation=two_view.translation * length, covariance=C * jnp.outer(s, s))
 
 
 def tangent_basis(n: Float[Array, "3"]) -> Float[Array, "3 2"]:

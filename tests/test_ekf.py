@@ -228,6 +228,35 @@ def test_update_equals_the_dense_iterated_filter(passes):
     np.testing.assert_allclose(diagnostics.nis, expected[3], rtol=1e-6)
 
 
+@pytest.mark.parametrize("m", [1, 2])
+def test_noise_scales_and_the_likelihood_after_robust_weights(m):
+    """A scaled noise is another noise; every item that is used counts in full, about the robust estimate."""
+    rng = np.random.default_rng(m)
+    A, H = rng.standard_normal((4, 4)), rng.standard_normal((20, m, 4))
+    R, scale = np.tile(0.2 * np.eye(m), (20, 1, 1)), rng.uniform(0.5, 2, 20)
+    observed, mask = H @ rng.standard_normal(4) + 0.3 * rng.standard_normal((20, m)), np.arange(20) > 0
+    observed[1:4] += 30
+    belief = ekf.Belief(jnp.zeros(4), jnp.asarray(A @ A.T))
+    model, robust = Linear(jnp.eye(4), jnp.eye(4)), ekf.Robust()
+    scaled = R * scale[:, None, None] ** 2
+    seen = jnp.asarray(observed), jnp.asarray(mask)
+    junk = jnp.where(mask, scale, jnp.nan)
+    items, other = ({"H": jnp.asarray(H), "R": jnp.asarray(r)} for r in (R, scaled))
+    found, says = update(model, belief, items, *seen, passes=9, robust=robust, noise_scale=junk)
+    expected, told = update(model, belief, other, *seen, passes=9, robust=robust)
+    assert_trees_close((found, says), (expected, told), rtol=1e-9, atol=1e-12)
+
+    used, P = np.asarray(says.weights) > 0, np.asarray(belief.covariance)
+    assert (int(says.measured), int(says.used)) == (19, used.sum())
+    assert 3 < used[4:].sum() == used.sum()
+    e, after = np.asarray(found.mean), observed - H @ np.asarray(found.mean)
+    nis = e @ np.linalg.solve(P, e) + np.einsum("ni,nij,nj->n", after, np.linalg.inv(scaled), after)[used].sum()
+    np.testing.assert_allclose(says.nis, nis, rtol=1e-9)
+    weighted = np.einsum("n,nia,nij,njb->ab", says.weights, H, np.linalg.inv(scaled), H)
+    log_det = np.linalg.slogdet(np.eye(4) + P @ weighted)[1] + np.linalg.slogdet(2 * np.pi * scaled[used])[1].sum()
+    np.testing.assert_allclose(says.log_likelihood, -(nis + log_det) / 2, rtol=1e-9)
+
+
 class PartlyConsidered(Linear):
     considered = np.array([False, True, False, True])
 

@@ -87,7 +87,8 @@ def test_single_pairs_restart_and_keep_the_scale():
 def bases_tracks(pixels, visible, fresh, ids):
     from jaxtri.vision.klt import FrameTracks
 
-    return FrameTracks(pixels, visible, fresh, ids, np.zeros(len(ids)))
+    unknown = np.full(len(ids), np.nan)
+    return FrameTracks(pixels, visible, fresh, ids, unknown, unknown)
 
 
 def test_frames_before_the_first_motion_are_filled_in():

@@ -15,6 +15,7 @@ from jaxtri.geometry.pose import local, retract
 from jaxtri.geometry.trifocal import project
 from jaxtri.models.depth import Bank, Depth, WorldPoint
 from jaxtri.models.motion import Kinematics, acceleration_noise, at_rest, from_two_view
+from jaxtri.scan import checkpointed
 from jaxtri.two_view import TwoView
 
 
@@ -97,6 +98,7 @@ def filter(
     *,
     passes: int = 4,
     robust: ekf.Robust | None = None,
+    block: int = 1,
 ) -> tuple[TwoStepBelief, ekf.Diagnostics]:
     """Beliefs and diagnostics of all frames, stacked along a leading axis t."""
 
@@ -104,7 +106,7 @@ def filter(
         carry, diagnostics = step(model, carry, *frame, passes=passes, robust=robust)
         return carry, (carry, diagnostics)
 
-    return jax.lax.scan(jax.checkpoint(body), belief, (observed, mask))[1]
+    return checkpointed(body, belief, (observed, mask), block)[1]
 
 
 def planar_start(

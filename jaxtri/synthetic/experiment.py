@@ -6,6 +6,7 @@ camera), its centre of rotation (the centre of the object), and the scale gauge 
 first base line may be given instead). All but the centre may be changed.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -39,10 +40,12 @@ def paper_experiment(
     pixel_mm: float = 0.01,
     signs: Float[Array, "3 6"] | None = None,
     base_line: float | None = None,
+    phases: Sequence[int] = (0, 1, 2),
 ) -> Experiment:
     """One trial: pure translation, pure rotation, then both, each a third of the frames; vmap over keys.
 
-    `signs` (+-1) are those of the motion, a row per segment, columns (tx, ty, tz, rx, ry, rz); drawn by
+    `phases` are those of the three that are run, in equal parts: (2,) is the general motion alone. `signs` (+-1) are
+    those of the motion, a row per phase, columns (tx, ty, tz, rx, ry, rz); drawn by
     default, tz positive. With `base_line` the scene and its motion are scaled so that the camera's first step
     has this length.
     """
@@ -51,7 +54,8 @@ def paper_experiment(
     centre = jnp.array([0.0, 0.0, distance_m])
     points = centre + jax.random.uniform(k_points, (n_points, 3), minval=-side / 2, maxval=side / 2)
 
-    segment = jnp.minimum(jnp.arange(n_frames - 1) * 3 // (n_frames - 1), 2)
+    part = jnp.minimum(jnp.arange(n_frames - 1) * len(phases) // (n_frames - 1), len(phases) - 1)
+    segment = jnp.array(phases)[part]
     if signs is None:
         signs = jnp.where(jax.random.bernoulli(k_sign, shape=(3, 6)), 1.0, -1.0).at[:, 2].set(1.0)
     low, high = metres_per_frame

@@ -28,8 +28,9 @@ class FrameTracks(NamedTuple):
     """Features of one frame in fixed slots.
 
     A slot keeps its feature from frame to frame as long as `visible` stays True; `fresh` marks the slots
-    whose feature is seen for the first time. `ids` number the features; `error` is the forward-backward
-    distance in pixels.
+    whose feature is seen for the first time. `ids` number the features. How well each was followed: `error` is
+    the forward-backward distance in pixels, `eigenvalue` the smaller one of the patch's gradient matrix per
+    pixel (`cv2.OPTFLOW_LK_GET_MIN_EIGENVALS`); NaN where nothing is known, as of a fresh feature.
     """
 
     pixels: np.ndarray  # (n, 2) float64
@@ -37,6 +38,7 @@ class FrameTracks(NamedTuple):
     fresh: np.ndarray  # (n,) bool
     ids: np.ndarray  # (n,) int64
     error: np.ndarray  # (n,) float64
+    eigenvalue: np.ndarray  # (n,) float64
 
 
 @dataclass
@@ -75,14 +77,14 @@ class KLT:
                 f"frame {self._frame} is {w}x{h}, the frames before it {w0}x{h0}: split the video there"
             )
         self._shape = gray.shape
-        error = np.zeros(self.settings.capacity)
+        error, eigenvalue = np.full((2, self.settings.capacity), np.nan)
         if self._previous is not None and self._alive.any():
             slots = np.flatnonzero(self._alive)
-            moved, ok, fb = self._flow(self._previous, gray, self._pixels[slots], None, self.settings.levels)
+            moved, ok, *quality = self._flow(self._previous, gray, self._pixels[slots], None, self.settings.levels)
             self._pixels[slots] = moved
-            error[slots] = fb
+            error[slots], eigenvalue[slots] = quality
             self._alive[slots] = ok & self._inside(moved)
-            self._realign(gray, error)
+            self._realign(gray, error, eigenvalue)
             self._separate()
         fresh = np.zeros(self.settings.capacity, bool)
         if self._alive.sum() < self.settings.refill * self.settings.capacity:
@@ -90,7 +92,8 @@ class KLT:
         self._previous = gray
         used = set(self._anchor[self._alive].tolist())
         self._anchors = {k: v for k, v in self._anchors.items() if k in used}
-        return FrameTracks(self._pixels.astype(np.float64), self._alive.copy(), fresh, self._ids.copy(), error)
+        pixels, alive, ids = self._pixels.astype(np.float64), self._alive.copy(), self._ids.copy()
+        return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue)
 
     def drop(self, slots: np.ndarray) -> None:
         """Give up the features of a boolean mask (n,): the filter found them to be outliers."""
@@ -98,30 +101,31 @@ class KLT:
 
     def _flow(
         self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray, guess: np.ndarray | None, levels: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in `b`, whether tracking there and back agrees, and by how many pixels it does not."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Positions in `b`, whether tracking there and back agrees, by how many pixels it does not, eigenvalues."""
         s = self.settings
         window, stop = (s.window, s.window), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
         start = (pixels if guess is None else guess).reshape(-1, 1, 2).copy()
         origin = pixels.reshape(-1, 1, 2)
-        flags = cv2.OPTFLOW_USE_INITIAL_FLOW  # without a guess the flow starts from standing still, as it would
-        there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, origin, start, None, None, window, levels, stop, flags)
+        # Without a guess the flow starts from standing still, as it would.
+        flags = cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
+        there, ok, eigenvalue = cv2.calcOpticalFlowPyrLK(a, b, origin, start, None, None, window, levels, stop, flags)
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, origin.copy(), None, None, window, levels, stop, flags)
         there, back = there.reshape(-1, 2), back.reshape(-1, 2)
         distance = np.linalg.norm(back - pixels, axis=1)
         good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (distance < s.forward_backward)
-        return there, np.asarray(good & np.isfinite(there).all(axis=1)), distance
+        return there, np.asarray(good & np.isfinite(there).all(axis=1)), distance, eigenvalue.ravel()
 
-    def _realign(self, gray: np.ndarray, error: np.ndarray) -> None:
+    def _realign(self, gray: np.ndarray, error: np.ndarray, eigenvalue: np.ndarray) -> None:
         for frame in np.unique(self._anchor[self._alive]):
             slots = np.flatnonzero(self._alive & (self._anchor == frame))
             if frame == self._frame - 1:
                 continue
             guess = self._pixels[slots]
-            moved, ok, fb = self._flow(self._anchors[int(frame)], gray, self._anchor_pixels[slots], guess, 0)
+            moved, ok, fb, smaller = self._flow(self._anchors[int(frame)], gray, self._anchor_pixels[slots], guess, 0)
             ok &= np.linalg.norm(moved - guess, axis=1) < self.settings.anchor_move
             self._pixels[slots[ok]] = moved[ok]
-            error[slots[ok]] = fb[ok]
+            error[slots[ok]], eigenvalue[slots[ok]] = fb[ok], smaller[ok]
             self._set_anchor(slots[~ok], gray)
 
     def _set_anchor(self, slots: np.ndarray, gray: np.ndarray) -> None:

@@ -1,0 +1,134 @@
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tracks import sideways
+
+from jaxtri import replay
+from jaxtri.bases import Base, StartSettings
+from jaxtri.ekf import Diagnostics
+from jaxtri.errors import InitialisationError, InputError
+from jaxtri.geometry.camera import BrownConrady, Camera
+from jaxtri.odometry import Odometry
+from jaxtri.pipeline import follow_tracks
+from jaxtri.scan import checkpointed
+from jaxtri.tracker import Report, Settings
+
+TRACKS = sideways(16, seed=1)
+SETTINGS = Settings.of(TRACKS.camera, noise_px=0.3)
+
+
+def live(base, overlap=1):
+    """A run of the driver, restarted once where one pair serves all, and its recording."""
+    start = dataclasses.replace(StartSettings.of(base), restart=0.94, overlap=overlap)
+    odometry = follow_tracks(
+        TRACKS.camera, TRACKS.pixels, TRACKS.visible, base=base, settings=SETTINGS, start=start, record=True
+    )
+    assert odometry.changes == (base is not Base.TRACKS)
+    return odometry, odometry.recording()
+
+
+def scaled(log_factors):
+    """Camera and settings, the focal length and what a user may tune multiplied."""
+    f = jnp.exp(log_factors)
+    camera = eqx.tree_at(lambda c: (c.fx, c.fy), TRACKS.camera, (TRACKS.camera.fx * f[0], TRACKS.camera.fy * f[0]))
+
+    def tuned(s):
+        return s.sigma, s.acceleration, s.angular_acceleration, s.robust.scale
+
+    return camera, eqx.tree_at(tuned, SETTINGS, tuple(x * y for x, y in zip(tuned(SETTINGS), f[1:], strict=True)))
+
+
+def agrees(odometry, recording, report):
+    """Whether a replay says of its frames what the driver said."""
+    measured = np.asarray(recording.frames)
+    if report.covariance.ndim == 3:
+        measured = np.arange(1, len(recording.pixels))
+    told = [odometry.poses[odometry.base_pair[0] + k] for k in measured[measured >= 0]]
+    poses, covariances = (np.asarray(x)[measured >= 0] for x in (report.pose.as_matrix(), report.covariance))
+    np.testing.assert_allclose(poses, np.stack([p.T_camera_world for p in told]), atol=1e-9)
+    np.testing.assert_allclose(covariances, np.stack([p.covariance for p in told]), atol=1e-11)
+
+
+@pytest.mark.parametrize("base", [Base.TRACKS, Base.INHERIT])
+def test_a_replay_is_the_run(base):
+    odometry, recording = live(base)
+    again = jax.jit(replay.tracks if base is Base.TRACKS else replay.pairs)
+    agrees(odometry, recording, again(TRACKS.camera, SETTINGS, recording))
+
+
+def test_the_gradient_through_a_restart_is_that_of_differences():
+    """With the hand-over of the scale, from the intrinsics to the poses and the likelihood."""
+    odometry, recording = live(Base.PAPER, overlap=2)
+
+    def loss(x):
+        camera, settings = scaled(x)
+        report = replay.pairs(camera, settings, recording)
+        return replay.negative_log_likelihood(camera, recording, report), report
+
+    value = jax.jit(jax.value_and_grad(loss, has_aux=True))
+    (_, report), slope = value(jnp.zeros(5))
+    agrees(odometry, recording, report)
+    h = 1e-4
+    steps = jnp.asarray(h * np.eye(5))
+    differences = [(value(s)[0][0] - value(-s)[0][0]) / (2 * h) for s in steps]
+    np.testing.assert_allclose(slope, differences, atol=1e-5 * np.linalg.norm(differences))
+    assert (np.abs(differences) > 1e-4 * np.linalg.norm(differences)).all()
+
+
+def test_likelihoods_are_those_of_pixels():
+    """By the change of variables, through distortion too; what a gate leaves out is drawn evenly from the image."""
+    lens = BrownConrady.from_coefficients([-0.2, 0.05, 0.001, -0.002])
+    camera = Camera.from_parameters(500, 520, 320, 240, width=640, height=480, distortion=lens)
+    rng = np.random.default_rng(0)
+    pixels = jnp.asarray(rng.uniform(100, 400, (3, 5, 2)))
+    _, recording = live(Base.TRACKS)
+    recording = dataclasses.replace(recording, pixels=pixels, visible=jnp.ones((3, 5), bool).at[1, 4].set(False))
+    weights = jnp.asarray([[1.0, 0.5, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.0, 1.0]])
+    said = jax.vmap(Diagnostics)(
+        jnp.asarray([30.0, 40.0]), jnp.zeros(2), jnp.asarray([4, 5]), jnp.asarray([3, 5]), weights, weights
+    )
+    report = Report(None, None, None, None, None, said)
+    jacobians = jax.vmap(jax.vmap(jax.jacrev(camera.to_normalised)))(pixels[1:])
+    log_det = np.log(np.abs(np.linalg.det(jacobians)))[np.asarray(weights) > 0].sum()
+    expected = -(70 + log_det - np.log(640 * 480)) / 18
+    np.testing.assert_allclose(replay.negative_log_likelihood(camera, recording, report), expected, rtol=1e-12)
+    plain = dataclasses.replace(camera, distortion=None)
+    expected = -(70 - 8 * np.log(500 * 520) - np.log(640 * 480)) / 18
+    np.testing.assert_allclose(replay.negative_log_likelihood(plain, recording, report), expected, rtol=1e-12)
+
+
+def test_a_recording_can_be_cut_and_wants_a_start():
+    _, recording = live(Base.INHERIT)
+    t = int(recording.second[1])
+    assert len(recording.until(t + 1).first) == 2
+    short = recording.until(t)
+    assert short.pixels.shape[0] == t
+    assert short.frames.tolist() == [list(range(int(recording.second[0]) + 1, t))]
+    with pytest.raises(InputError, match="record=True"):
+        Odometry(TRACKS.camera).recording()
+    still = np.broadcast_to(TRACKS.pixels[:1], (4, *TRACKS.pixels.shape[1:]))
+    seen = np.broadcast_to(TRACKS.visible[:1], still.shape[:2])
+    with pytest.raises(InitialisationError, match="flow"):
+        follow_tracks(TRACKS.camera, still, seen, record=True).recording()
+
+
+@pytest.mark.parametrize("block", [1, 3, 4, 12, 20])
+def test_a_scan_in_blocks_is_a_scan(block):
+    def body(carry, x):
+        carry = jnp.sin(carry * x["a"]) + x["b"]
+        return carry, (carry**2, jnp.sum(x["b"]))
+
+    rng = np.random.default_rng(0)
+    xs = {"a": jnp.asarray(rng.normal(size=12)), "b": jnp.asarray(rng.normal(size=(12, 3)))}
+
+    def loss(xs, scan):
+        carry, (squares, sums) = scan(body, jnp.ones(3), xs)
+        return jnp.sum(carry) + jnp.sum(squares * jnp.arange(36).reshape(12, 3)) + sums @ sums
+
+    ours = jax.value_and_grad(loss)(xs, lambda *a: checkpointed(*a, block=block))
+    theirs = jax.value_and_grad(loss)(xs, jax.lax.scan)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), ours, theirs)
