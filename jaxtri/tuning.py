@@ -5,7 +5,8 @@ ground truth, the reprojection error. A parameter is any leaf of the model, whic
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxlie import SE3
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
 from jaxtri.ekf import Diagnostics, stand_in
@@ -101,54 +102,84 @@ def fit(
         if p.log and not bool(jnp.all(leaves[name] > p.floor)):
             raise InputError(f"{name} is {leaves[name]}: to be fitted by its logarithm it must be above {p.floor:g}")
     first = {name: p.free(leaves[name]) for name, p in parameters.items()}
-
-    def put(free: Mapping[str, Array]) -> M:
-        wheres = [p.where for p in parameters.values()]
-        values = [p.value(free[name]).astype(leaves[name].dtype) for name, p in parameters.items()]
-        return eqx.tree_at(lambda m: [w(m) for w in wheres], model, values)
-
-    def objective(free: Mapping[str, Array], data: D) -> Float[Array, ""]:
-        value = loss(put(free), data)
-        for name, p in parameters.items():
-            if p.prior_sd is not None:
-                value = value + jnp.sum(jnp.square((free[name] - first[name]) / p.prior_sd)) / 2
-        return value
-
-    value = jax.jit(objective)
-    before = float(value(first, data))
+    objective = _Objective(model, first, jnp.asarray(-1), loss, tuple(parameters.items()))
+    before = float(_evaluate(objective, first, data))
     if not math.isfinite(before):
         raise InputError(f"the loss at the start is {before}: begin with larger noises, or look for NaN in the data")
     count = sum(x.size for x in leaves.values())
     options = {"autodiff_mode": "fwd" if (count <= 4 if forward is None else forward) else "bwd"}
     solver = optx.BFGS(rtol=1e-6, atol=1e-6) if solver is None else solver
     found, best, key = None, math.inf, jax.random.key(seed)
-    with tqdm(total=starts * max_steps, desc="fit", leave=False, disable=None if progress else True) as bar:
-
-        def show(value: Array) -> None:
-            bar.update()
-            bar.set_postfix_str(f"loss {float(value):.6g}", refresh=False)
-
-        def watched(free: Mapping[str, Array], data: D) -> Float[Array, ""]:
-            value = objective(free, data)
-            jax.debug.callback(show, value)
-            return value
-
+    with _bar(starts * max_steps, progress) as bar:
+        watched = eqx.tree_at(lambda o: o.bar, objective, bar)
         for k in range(starts):
             begun = first
             if k:
                 keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
                 begun = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
             solution = optx.minimise(watched, solver, begun, data, options, max_steps=max_steps, throw=False)
-            reached = float(value(solution.value, data))
+            reached = float(_evaluate(objective, solution.value, data))
             reached = math.inf if math.isnan(reached) else reached
             if found is None or reached < best:
                 found, best = solution, reached
-        jax.effects_barrier()  # the bar's last updates come before it closes
     assert found is not None
-    fitted = put(found.value)
+    fitted = objective.put(found.value)
     changes = {n: (np.asarray(leaves[n]), np.asarray(p.where(fitted))) for n, p in parameters.items()}
     converged = bool(found.result == optx.RESULTS.successful) and math.isfinite(best)
     return Fit(fitted, converged, before, best, int(found.stats["num_steps"]), changes)
+
+
+class _Objective(eqx.Module):
+    """The loss as a function of the free numbers; a pytree, so that a second fit of its kind is not compiled again."""
+
+    model: Any
+    first: dict[str, Array]
+    bar: Int[Array, ""]  # of `_BARS`
+    loss: Callable[[Any, Any], Float[Array, ""]] = eqx.field(static=True)
+    parameters: tuple[tuple[str, Parameter], ...] = eqx.field(static=True)
+
+    def put(self, free: Mapping[str, Array]) -> Any:
+        """The model with the parameters in their places."""
+        wheres = [p.where for _, p in self.parameters]
+        values = [p.value(free[name]).astype(jnp.asarray(p.where(self.model)).dtype) for name, p in self.parameters]
+        return eqx.tree_at(lambda m: [w(m) for w in wheres], self.model, values)
+
+    def __call__(self, free: Mapping[str, Array], data: Any) -> Float[Array, ""]:
+        """The loss, with what the priors say."""
+        value = self.loss(self.put(free), data)
+        for name, p in self.parameters:
+            if p.prior_sd is not None:
+                value = value + jnp.sum(jnp.square((free[name] - self.first[name]) / p.prior_sd)) / 2
+        jax.debug.callback(_show, self.bar, value)
+        return value
+
+
+@eqx.filter_jit
+def _evaluate(objective: _Objective, free: Mapping[str, Array], data: Any) -> Float[Array, ""]:
+    return objective(free, data)
+
+
+_BARS: dict[int, tqdm] = {}
+
+
+@contextmanager
+def _bar(total: int, progress: bool) -> Iterator[Int[Array, ""]]:
+    # By number: a compiled function cannot hold the bar itself, or it would be compiled for every bar.
+    number = max(_BARS, default=0) + 1
+    with tqdm(total=total, desc="fit", leave=False, disable=None if progress else True) as bar:
+        _BARS[number] = bar
+        try:
+            yield jnp.asarray(number)
+        finally:
+            jax.effects_barrier()  # the last updates come before the bar closes
+            del _BARS[number]
+
+
+def _show(number: Array, value: Array) -> None:
+    bar = _BARS.get(int(number))
+    if bar is not None:
+        bar.update()
+        bar.set_postfix_str(f"loss {float(value):.6g}", refresh=False)
 
 
 def negative_log_likelihood(

@@ -7,14 +7,14 @@ from jaxtyping import Array, Float
 from jaxtri.ekf import number
 
 # About the medians of the tracker's figures on video: where the noise is sigma.
-_ERROR_PX = 0.03
+_ERROR_PX = 0.1
 _EIGENVALUE = 0.03
 
 
 class PointNoise(eqx.Module):
     """Standard deviation of a point's noise over sigma: a power of each of the tracker's figures.
 
-    (error / 0.03 px) ** a * (eigenvalue / 0.03) ** b, both ratios kept between 1/30 and 30; 1 where a figure is not
+    (error / 0.1 px) ** a * (eigenvalue / 0.03) ** b, both ratios kept between 1/30 and 30; 1 where a figure is not
     known. All zero, the default, is the same noise for all.
     """
 
