@@ -5,6 +5,10 @@
 The paper's experiment, 99 frames of 300 points; the gradient with respect to sigma and both accelerations. `reverse`
 and `forward` are modes of differentiation; `block` is the frames between two kept beliefs (`jaxtri.scan`). Times are
 medians over interleaved runs, memory is what the compiler sets aside beside arguments and results.
+
+Last answer (2 cores, JAX 0.10, of `default` with `block` 1, other load beside): run .10 s, reverse gradient .67 s, 6.8
+times (5 asked), 2.5 MB, compiled in 19 s. Of these 6.8 the run itself is one, and two more are runs done again: what
+happens in a frame and in a pass is not kept.
 """
 
 import time

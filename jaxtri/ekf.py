@@ -5,7 +5,7 @@ the manifold and the measurement of one item; the update sums over N items and n
 covariance of all of them. Nothing here knows of cameras.
 """
 
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -201,10 +201,14 @@ def scales(P: Float[Array, "d d"]) -> Float[Array, " d"]:
 def regression(P: Float[Array, "d d"], cross: Float[Array, "d e"]) -> Float[Array, "e d"]:
     """cross' P^-1, what errors of covariance P say of others; a P that may be singular, where `cross` is zero, too."""
     s = scales(P)
-    # Any regression is right, its remainder being what it is; a ridge makes it one.
-    ridge = 10 * len(P) * jnp.finfo(P.dtype).eps
-    scaled = P / jnp.outer(s, s) + ridge * jnp.eye(len(P), dtype=P.dtype)
-    return (jnp.linalg.solve(scaled, cross / s[:, None]) / s[:, None]).T
+    scaled, cross = P / jnp.outer(s, s), cross / s[:, None]
+    # A direction without uncertainty gets no weight: rounding over the ridge, which must be far above it. What the
+    # ridge takes from all others a second step gives back, up to its square.
+    ridge = jnp.sqrt(jnp.finfo(P.dtype).eps)
+    factors = jax.scipy.linalg.lu_factor(scaled + ridge * jnp.eye(len(P), dtype=P.dtype))
+    found = jax.scipy.linalg.lu_solve(factors, cross)
+    found = found + jax.scipy.linalg.lu_solve(factors, cross - scaled @ found)
+    return (found / s[:, None]).T
 
 
 def _system(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
@@ -224,18 +228,31 @@ def posterior_error(P: Float[Array, "d d"], A: Float[Array, "d d"], b: Float[Arr
     return jnp.linalg.solve(M, Ps @ (b * s)) * s
 
 
-def _posterior(P: Array, A: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Posterior error, its covariance (P^-1 + A)^-1, and log det (I + P A).
+def _posterior(P: Array, A: Array) -> tuple[Array, Array]:
+    """Covariance of the posterior error, (P^-1 + A)^-1, and log det (I + P A).
 
     With X = (I + P A)^-1 the covariance is X P. Written as a sum of squares, X P X' + (X P) A (X P)', which is
     Joseph's form, it stays positive when X is off by rounding: in float32 X P itself does not.
     """
     M, Ps, As, s = _system(P, A)
-    X = jnp.linalg.solve(M, jnp.eye(s.size, dtype=P.dtype))
+    eye = jnp.eye(s.size, dtype=P.dtype)
+    # What is known exactly stays so: a variance of rounding would be a scale to all that divides by it.
+    X = jnp.where(jnp.diagonal(P)[:, None] > 0, jnp.linalg.solve(M, eye), eye)
     XP = X @ Ps
     covariance = XP @ X.T + XP @ As @ XP.T
-    error = XP @ (b * s)
-    return error * s, (covariance + covariance.T) / 2 * jnp.outer(s, s), jnp.linalg.slogdet(M)[1]
+    return (covariance + covariance.T) / 2 * jnp.outer(s, s), jnp.linalg.slogdet(M)[1]
+
+
+class _Pass(NamedTuple):
+    """One pass of an update: where it linearised, what it found there, and the error that is best by it."""
+
+    delta: Float[Array, " d"]
+    lin: _Linearisation
+    weights: Float[Array, " n"]
+    used: Bool[Array, " n"]
+    A: Float[Array, "d d"]
+    b: Float[Array, " d"]
+    optimal: Float[Array, " d"]
 
 
 def _distance(lin: _Linearisation) -> Array:
@@ -332,21 +349,24 @@ def update(
     def correct(error: Array) -> Array:
         return error if considered is None else jnp.where(considered, 0.0, error)
 
-    def iterate(k: Array, delta: Array) -> Array:
+    def iterate(k: Array, before: _Pass) -> _Pass:
+        delta = correct(before.optimal)
         lin = _linearise(model, prior, delta, items, observed, mask, noise_scale)
-        A, b = _normal_equations(lin, weigh(lin, k), delta)
-        return correct(posterior_error(P, A, b))
+        weights, used = weigh(lin, k), mask
+        if robust is not None:
+            used = mask & (_distance(lin) < robust.gate.astype(dtype))
+            weights = jnp.where((k == passes - 1) & ~used, 0.0, weights)
+        A, b = _normal_equations(lin, weights, delta)
+        return _Pass(delta, lin, weights, used, A, b, posterior_error(P, A, b))
 
-    # A loop, not an unrolled chain: unrolling multiplies the compile time by the number of passes.
-    delta = jax.lax.fori_loop(0, passes - 1, iterate, jnp.zeros(P.shape[0], dtype))
-    lin = _linearise(model, prior, delta, items, observed, mask, noise_scale)
-    weights = weigh(lin, jnp.asarray(passes - 1))
-    used = mask
-    if robust is not None:
-        used = mask & (_distance(lin) < robust.gate.astype(dtype))
-        weights = jnp.where(used, weights, 0.0)
-    A, b = _normal_equations(lin, weights, delta)
-    optimal, covariance, log_det = _posterior(P, A, b)
+    # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
+    (n, m), d = observed.shape, P.shape[0]
+    zero, square = jnp.zeros(d, dtype), jnp.zeros((d, d), dtype)
+    nothing = _Linearisation(*(jnp.zeros(shape, dtype) for shape in ((n, m), (n, m, d), (n, m, m), (n,))))
+    last = _Pass(zero, nothing, valid, mask, square, zero, zero)
+    last = jax.lax.fori_loop(0, passes, jax.checkpoint(iterate), last)
+    delta, lin, weights, used, A, b, optimal = last
+    covariance, log_det = _posterior(P, A)
     final = correct(optimal)
     if considered is not None:
         # The gain of all other components is the optimal one, and so is what they have in common with these.
@@ -361,7 +381,6 @@ def update(
     quadratic = jnp.sum(jnp.where(used, _distance(_moved(lin, optimal - delta)), 0.0))
     nis = quadratic + optimal @ (b - A @ optimal)
     log_det = log_det + jnp.sum(jnp.where(used, lin.log_det, 0.0))
-    m = observed.shape[-1]
     constant = m * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
     diagnostics = Diagnostics(
         log_likelihood=-(nis + log_det + constant) / 2,

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
@@ -82,6 +83,7 @@ def fit(
     spread: float = 1.0,
     seed: int = 0,
     max_steps: int = 64,
+    first_step: float = 1.0,
     forward: bool | None = None,
     progress: bool = True,
 ) -> Fit[M]:
@@ -89,8 +91,8 @@ def fit(
 
     The solver is BFGS by default. The first start is the model itself, further ones are drawn about it with the
     standard deviation `spread` (of the logarithm, where that is fitted). The gradient is taken in forward mode
-    for up to four numbers and in reverse for more, or as `forward` says. Losses should be of order one, a mean
-    over the data, for the first step to be of a sensible length. Host only.
+    for up to four numbers and in reverse for more, or as `forward` says. Far from the best the slope of a likelihood
+    is steep: the loss is scaled down where the first step along it would be longer than `first_step`. Host only.
 
     Raises `InputError` where a parameter cannot be fitted as it stands, or where the loss at the start is not finite
     or does not depend on any parameter.
@@ -102,31 +104,40 @@ def fit(
         if p.log and not bool(jnp.all(leaves[name] > p.floor)):
             raise InputError(f"{name} is {leaves[name]}: to be fitted by its logarithm it must be above {p.floor:g}")
     first = {name: p.free(leaves[name]) for name, p in parameters.items()}
-    objective = _Objective(model, first, jnp.asarray(-1), loss, tuple(parameters.items()))
+    objective = _Objective(model, first, jnp.asarray(-1), jnp.asarray(1.0), loss, tuple(parameters.items()))
     before = float(_evaluate(objective, first, data))
     if not math.isfinite(before):
         raise InputError(f"the loss at the start is {before}: begin with larger noises, or look for NaN in the data")
     count = sum(x.size for x in leaves.values())
     options = {"autodiff_mode": "fwd" if (count <= 4 if forward is None else forward) else "bwd"}
     solver = optx.BFGS(rtol=1e-6, atol=1e-6) if solver is None else solver
-    found, best, key = None, math.inf, jax.random.key(seed)
+    found, best, steps, key = None, math.inf, 0, jax.random.key(seed)
+
+    def reached(at: dict[str, Array]) -> float:
+        value = float(_evaluate(objective, at, data))
+        return math.inf if math.isnan(value) else value
+
     with _bar(starts * max_steps, progress) as bar:
-        watched = eqx.tree_at(lambda o: o.bar, objective, bar)
         for k in range(starts):
-            begun = first
+            at = first
             if k:
                 keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
-                begun = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
-            solution = optx.minimise(watched, solver, begun, data, options, max_steps=max_steps, throw=False)
-            reached = float(_evaluate(objective, solution.value, data))
-            reached = math.inf if math.isnan(reached) else reached
-            if found is None or reached < best:
-                found, best = solution, reached
+                at = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
+            scale, left = 0.0, max_steps
+            while scale < 1 and left > 0:  # again from where the slope is less steep
+                scale = min(1.0, max(first_step / _slope(reached, at), 10 * scale))
+                watched = eqx.tree_at(lambda o: (o.bar, o.scale), objective, (bar, jnp.asarray(scale)))
+                solution = optx.minimise(watched, solver, at, data, options, max_steps=max_steps, throw=False)
+                at, taken = solution.value, int(solution.stats["num_steps"])
+                left, steps = left - taken, steps + taken
+                value = reached(at)
+                if found is None or value <= best:
+                    found, best = solution, value
     assert found is not None
     fitted = objective.put(found.value)
     changes = {n: (np.asarray(leaves[n]), np.asarray(p.where(fitted))) for n, p in parameters.items()}
     converged = bool(found.result == optx.RESULTS.successful) and math.isfinite(best)
-    return Fit(fitted, converged, before, best, int(found.stats["num_steps"]), changes)
+    return Fit(fitted, converged, before, best, steps, changes)
 
 
 class _Objective(eqx.Module):
@@ -135,6 +146,7 @@ class _Objective(eqx.Module):
     model: Any
     first: dict[str, Array]
     bar: Int[Array, ""]  # of `_BARS`
+    scale: Float[Array, ""]  # of the loss
     loss: Callable[[Any, Any], Float[Array, ""]] = eqx.field(static=True)
     parameters: tuple[tuple[str, Parameter], ...] = eqx.field(static=True)
 
@@ -151,12 +163,25 @@ class _Objective(eqx.Module):
             if p.prior_sd is not None:
                 value = value + jnp.sum(jnp.square((free[name] - self.first[name]) / p.prior_sd)) / 2
         jax.debug.callback(_show, self.bar, value)
-        return value
+        return value * self.scale.astype(value.dtype)
 
 
 @eqx.filter_jit
 def _evaluate(objective: _Objective, free: Mapping[str, Array], data: Any) -> Float[Array, ""]:
     return objective(free, data)
+
+
+def _slope(value: Callable[[dict[str, Array]], float], at: dict[str, Array]) -> float:
+    """Length of the gradient, by differences along at most 16 directions: a gradient would be compiled once more."""
+    flat, unravel = ravel_pytree(at)
+    there = value(at)
+    directions = np.eye(flat.size)
+    if flat.size > 16:
+        directions = np.linalg.qr(np.random.default_rng(0).standard_normal((flat.size, 16)))[0].T
+    h = 1e-4
+    slopes = [(value(unravel(flat + h * jnp.asarray(d, flat.dtype))) - there) / h for d in directions]
+    length = float(np.linalg.norm(slopes)) * math.sqrt(flat.size / len(directions))
+    return length if math.isfinite(length) and length > 0 else 1.0
 
 
 _BARS: dict[int, tqdm] = {}

@@ -84,6 +84,7 @@ class Depth(eqx.Module):
         `relative_sd` is the standard deviation of the parameter over its value.
         """
         n, dtype = observed.shape[0], observed.dtype
+        observed = _there(observed)
         z_init = jnp.asarray(z_init, dtype)
         start = jnp.full(n, 1.0, dtype) * (1 / z_init if self.inverse else z_init)
         return self._bank(observed, start, jnp.square(relative_sd * start), pose)
@@ -212,7 +213,7 @@ class Depth(eqx.Module):
         spread = jnp.square(self.ray_sigma) * jnp.sum(by_noise[:, :2] ** 2, axis=1)
         spread += jnp.square(self.sigma) * jnp.sum(by_noise[:, 2:] ** 2, axis=1)
         pose = jnp.einsum("ni,ij,nj->n", by_pose, two_view.covariance, by_pose)
-        bank = self._bank(first, parameter, spread + pose, SE3.identity())
+        bank = self._bank(_there(first), parameter, spread + pose, SE3.identity())
         cross = jnp.square(self.ray_sigma) * by_noise[:, :2]
         return bank._replace(covariance=bank.covariance.at[:, 0, 1:].set(cross).at[:, 1:, 0].set(cross))
 
@@ -225,7 +226,7 @@ def triangulate(
     With respect to the errors (T, R) of the pose, and to the two observations. A depth is that of an inverse
     depth of at least a thousandth of the median.
     """
-    pairs, zero = jnp.concatenate([first, second], axis=-1), jnp.zeros(6, first.dtype)
+    pairs, zero = _there(jnp.concatenate([first, second], axis=-1)), jnp.zeros(6, first.dtype)
 
     def at(error: Array, pair: Array) -> Array:
         T, R = two_view.translation + error[:3], two_view.rotation.as_matrix()
@@ -263,6 +264,11 @@ def scale_variance(
     # The errors of the pose eliminated; its covariance is singular along the base line.
     eliminated = C @ jnp.linalg.solve(jnp.eye(6, dtype=C.dtype) + App @ C, A[1:, 0])
     return 1 / (A[0, 0] - A[0, 1:] @ eliminated)
+
+
+def _there(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """Zero for what is NaN: masked or not, a point that is not there would make every gradient NaN."""
+    return jnp.where(jnp.isfinite(u), u, jnp.zeros((), u.dtype))
 
 
 def _inverse_2x2(S: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
