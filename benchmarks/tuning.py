@@ -302,8 +302,8 @@ def likelihoods(model: Tracking, data: Sample) -> Array:
     return jax.lax.map(one, data)
 
 
-def tracks(data: Path, names: list[str], frames: int = 40) -> dict[str, dict[str, float]]:
-    """Leave one out: what the others teach, and what it does to the one."""
+def leave_one_out(data: Path, names: list[str], frames: int = 40) -> dict[str, dict[str, float]]:
+    """What the others teach of the tracks, and what it does to the one left out."""
     samples = [sample(data / name, frames) for name in names]
     each = jax.jit(likelihoods)
     zero = jnp.zeros(())
@@ -383,7 +383,7 @@ def main() -> None:
         print("\nfocal length on video\n" + table(["sequence", "from +10 %", "from -10 %"], rows), flush=True)
 
     if "tracks" in args.parts and len(names) > 1:
-        found = tracks(args.data, names)
+        found = leave_one_out(args.data, names)
         rows = []
         for name, said in found.items():
             figures |= {f"{name}.{k}": said[k] for k in ("nll_gain", "ate_ratio")}

@@ -74,11 +74,10 @@ _second_report = jax.jit(segments.second_report)
 
 
 class Start(NamedTuple):
-    """A base pair and the tracks that agree on it, or the reason why there is none yet."""
+    """A base pair, or the reason why there is none yet."""
 
-    pose: TwoView | None
+    found: Hypothesis | None
     reason: str
-    inside: np.ndarray | None = None  # (n,)
 
 
 class Restart(NamedTuple):
@@ -114,7 +113,7 @@ def find(settings: Settings, start: StartSettings, frames: list[Frame]) -> Start
         return Start(None, f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion")
     if not best.parallax_deg >= start.parallax_deg:
         return Start(None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed")
-    return Start(best.pose, "", best.inside)
+    return Start(best, "")
 
 
 def _transfer_cost(settings: Settings, h: Hypothesis, first: Frame, last: Frame, between: list[Frame]) -> float:
@@ -352,17 +351,18 @@ class SinglePair:
         first, pose1, covariance1 = known[0]
         frames = [k[0] for k in known[1:]] + [frame]
         second = frames[0]
-        found, _, inside = find(self.settings, self.start, [first, second])
-        if found is None or inside is None:
+        found = find(self.settings, self.start, [first, second]).found
+        if found is None:
             return None  # go on with the old pair as long as it lasts
         arrays = jnp.asarray(first.u), jnp.asarray(second.u)
         common = jnp.asarray(first.common(second) & (first.ids == self._ids))
-        pair, placement, count = _consecutive(self.settings, self.state, found, *arrays, common, pose1, covariance1)
+        pair = segments.Pair(*arrays, common, pose1, covariance1)
+        view, placement, count = _consecutive(self.settings, self.state, pair, found.pose)
         if count < 3:
             return None
         self._end()
-        self._begin(first, second, pair, placement)
-        self.begun.append(Restart(first.index, second.index, frame.index - 1, found, inside))
+        self._begin(first, second, view, placement)
+        self.begun.append(Restart(first.index, second.index, frame.index - 1, found.pose, found.inside))
         self.keyframes += 2
         report = _second_report(self.state)
         self._history = deque(known[:1], maxlen=40)
@@ -389,7 +389,7 @@ class SinglePair:
             return
         frame, other, covariance = choice
         arrays = jnp.asarray(frame.u), jnp.asarray(now.u), jnp.asarray(frame.common(now))
-        refined, placement = _inherited(self.settings, self.state, *arrays, other, covariance)
+        refined, placement = _inherited(self.settings, self.state, segments.Pair(*arrays, other, covariance))
         if not bool(refined.converged):
             return
         self._end()

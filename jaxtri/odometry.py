@@ -30,7 +30,8 @@ from jaxtri.geometry.camera import Camera
 from jaxtri.replay import Recording
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.trajectory import Trajectory
-from jaxtri.two_view import TwoView, scaled
+from jaxtri.two_view import scaled
+from jaxtri.vision.initialise import Hypothesis
 from jaxtri.vision.klt import FrameTracks
 
 
@@ -98,8 +99,7 @@ class Odometry:
         self._changes = 0
         self._recording = self.record  # up to where the camera is lost
         self._tracks: list[FrameTracks] = []
-        self._begun: list[Restart] = []
-        self._begun_later: list[Restart] = []
+        self._began: tuple[Restart, Follower] | None = None  # the first base pair, and what followed it
 
     def add(self, tracks: FrameTracks, time: float) -> np.ndarray:
         """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
@@ -187,10 +187,11 @@ class Odometry:
         """
         if not self.record:
             raise InputError("nothing was recorded: ask for it by record=True")
-        if not self._begun:
+        if self._began is None:
             raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
-        origin, dtype = self._begun[0].first, self._settings.sigma.dtype
-        kept, pairs = self._tracks[origin:], [*self._begun, *self._begun_later]
+        start, follower = self._began
+        origin, dtype = start.first, self._settings.sigma.dtype
+        kept, pairs = self._tracks[origin:], [start, *follower.begun]
         ends = [*(p.last for p in pairs[1:]), origin + len(kept) - 1]
         measured = [np.arange(p.second + 1, end + 1) - origin for p, end in zip(pairs, ends, strict=True)]
         frames = np.full((len(pairs), max(1, *map(len, measured))), -1)
@@ -270,11 +271,12 @@ class Odometry:
         self._tried = (first.index, flow)
         found = find(self._settings, self._start, self._waiting)
         self.reason = found.reason
-        if found.pose is not None and found.inside is not None:
-            self._begin(self._waiting, found.pose, found.inside)
+        if found.found is not None:
+            self._begin(self._waiting, found.found)
 
-    def _begin(self, frames: list[Frame], pose: TwoView, inside: np.ndarray) -> None:
+    def _begin(self, frames: list[Frame], found: Hypothesis) -> None:
         """Set up the filter from a base pair, and fill in the frames between and before."""
+        pose = found.pose
         first, last = frames[0], frames[-1]
         again = self.segments > 0
         world = jax.tree.map(lambda x: x.astype(pose.translation.dtype), SE3.identity())
@@ -286,7 +288,6 @@ class Odometry:
             self.scale_unknown_from = self.scale_unknown_from or first.index
         else:
             self.base_pair = (first.index, last.index)
-            self._begun = [Restart(first.index, last.index, first.index, pose, inside)]
         state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
         self._record(first, world, None, Status.RESTARTED if again else Status.TRACKING)
         for frame, report in [*reports, *self._backwards(first, state, world)]:
@@ -296,7 +297,7 @@ class Odometry:
         else:
             self._follower = SinglePair(self._settings, self._start, self.base, frames, pose, world)
         if not again:
-            self._begun_later = self._follower.begun
+            self._began = Restart(first.index, last.index, first.index, found.pose, found.inside), self._follower
         self.segments += 1
         self._waiting, self._passed = [], []
 

@@ -125,13 +125,13 @@ def pairs(camera: Camera, settings: Settings, recording: Recording, *, block: in
         # On to the next pair; after the last one its own once more, and nothing comes of it.
         k = jnp.minimum(k + 1, len(recording.first) - 1)
         a, b = recording.first[k], recording.second[k]
-        arrays = u[a], u[b], common(a, b), SE3(poses[a]).normalize(), covariances[a]
+        pair = segments.Pair(u[a], u[b], common(a, b), SE3(poses[a]).normalize(), covariances[a])
         if recording.inherit:
-            view, placement = segments.inherited(settings, state, *arrays)
+            view, placement = segments.inherited(settings, state, pair)
         else:
             guess = recording.translation[k], SO3(recording.rotation.wxyz[k])
             found = refine(*guess, u[a], u[b], recording.inside[k], settings.sigma)
-            view, placement, _ = segments.consecutive(settings, state, found, *arrays)
+            view, placement, _ = segments.consecutive(settings, state, pair, found)
         return (begin(a, b, view, placement), poses, covariances), reports
 
     placement = segments.origin(dtype)

@@ -195,48 +195,42 @@ def common_scale(
     return scale, jnp.pi / 2 * expected * jnp.maximum(spread, 1.0)
 
 
+class Pair(NamedTuple):
+    """The base pair that a segment hands over to."""
+
+    first: Float[Array, "n 2"]
+    second: Float[Array, "n 2"]
+    common: Bool[Array, " n"]  # tracks seen in both
+    pose: SE3  # of the first frame, in the segment that ends
+    covariance: Float[Array, "6 6"]
+
+    def placed(self, state: State, variance: Float[Array, ""]) -> Placement:
+        """Where it stands, given the variance that the hand-over adds to the logarithm of the scale."""
+        return Placement(self.pose, place(self.covariance, state.placement.covariance[6, 6] + variance))
+
+
 def consecutive(
-    settings: Settings,
-    state: State,
-    found: TwoView,
-    first: Float[Array, "n 2"],
-    second: Float[Array, "n 2"],
-    common: Bool[Array, " n"],
-    pose: SE3,
-    covariance: Float[Array, "6 6"],
+    settings: Settings, state: State, pair: Pair, found: TwoView
 ) -> tuple[TwoView, Placement, Int[Array, ""]]:
     """The paper's hand-over, to a pair that `found` relates: its scale is that of the points both segments know.
 
-    `pose` and `covariance` are those of the pair's first frame in the segment that ends. Also the number of points
-    that decide on the scale: fewer than three do not.
+    Also the number of points that decide on the scale: fewer than three do not.
     """
-    mask = state.inside & common
-    before = depths(state, relative(state.placement.pose, pose))
-    scale, variance = common_scale(*before, *pair_depths(found, first, second), mask, settings.sigma)
-    log_scale = state.placement.covariance[6, 6] + variance
-    return scaled(found, scale), Placement(pose, place(covariance, log_scale)), jnp.sum(mask)
+    mask = state.inside & pair.common
+    before = depths(state, relative(state.placement.pose, pair.pose))
+    after = pair_depths(found, pair.first, pair.second)
+    scale, variance = common_scale(*before, *after, mask, settings.sigma)
+    return scaled(found, scale), pair.placed(state, variance), jnp.sum(mask)
 
 
-def inherited(
-    settings: Settings,
-    state: State,
-    first: Float[Array, "n 2"],
-    second: Float[Array, "n 2"],
-    common: Bool[Array, " n"],
-    pose: SE3,
-    covariance: Float[Array, "6 6"],
-) -> tuple[TwoView, Placement]:
-    """The hand-over to a pair of a frame already tracked and the present one: their relative pose is the prior.
-
-    `pose` and `covariance` are those of the pair's first frame.
-    """
-    motion, own = relative(pose, world_pose(state)[0]), own_covariance(state)
+def inherited(settings: Settings, state: State, pair: Pair) -> tuple[TwoView, Placement]:
+    """The hand-over to a pair of a frame already tracked and the present one: their relative pose is the prior."""
+    motion, own = relative(pair.pose, world_pose(state)[0]), own_covariance(state)
     T = motion.translation()
     prior = shear(-T) @ (own + 1e-12 * jnp.eye(6, dtype=own.dtype)) @ shear(-T).T
-    refined = refine(T, motion.rotation(), first, second, common, settings.sigma, prior=prior)
+    refined = refine(T, motion.rotation(), pair.first, pair.second, pair.common, settings.sigma, prior=prior)
     direction = T / safe_norm(T)
-    log_scale = state.placement.covariance[6, 6] + direction @ own[:3, :3] @ direction / (T @ T)
-    return refined, Placement(pose, place(covariance, log_scale))
+    return refined, pair.placed(state, direction @ own[:3, :3] @ direction / (T @ T))
 
 
 def second_report(state: State) -> Report:

@@ -94,8 +94,7 @@ def fit(
     for up to four numbers and in reverse for more, or as `forward` says. Far from the best the slope of a likelihood
     is steep: the loss is scaled down where the first step along it would be longer than `first_step`. Host only.
 
-    Raises `InputError` where a parameter cannot be fitted as it stands, or where the loss at the start is not finite
-    or does not depend on any parameter.
+    Raises `InputError` where a parameter cannot be fitted as it stands or the loss at the start is not finite.
     """
     if not parameters or starts < 1:
         raise InputError(f"{len(parameters)} parameters and {starts} starts: a fit wants at least one of each")
@@ -123,9 +122,9 @@ def fit(
             if k:
                 keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
                 at = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
-            scale, left = 0.0, max_steps
+            scale, left, value = 0.0, max_steps, reached(at) if k else before
             while scale < 1 and left > 0:  # again from where the slope is less steep
-                scale = min(1.0, max(first_step / _slope(reached, at), 10 * scale))
+                scale = min(1.0, max(first_step / _slope(reached, at, value), 10 * scale))
                 watched = eqx.tree_at(lambda o: (o.bar, o.scale), objective, (bar, jnp.asarray(scale)))
                 solution = optx.minimise(watched, solver, at, data, options, max_steps=max_steps, throw=False)
                 at, taken = solution.value, int(solution.stats["num_steps"])
@@ -171,10 +170,9 @@ def _evaluate(objective: _Objective, free: Mapping[str, Array], data: Any) -> Fl
     return objective(free, data)
 
 
-def _slope(value: Callable[[dict[str, Array]], float], at: dict[str, Array]) -> float:
+def _slope(value: Callable[[dict[str, Array]], float], at: dict[str, Array], there: float) -> float:
     """Length of the gradient, by differences along at most 16 directions: a gradient would be compiled once more."""
     flat, unravel = ravel_pytree(at)
-    there = value(at)
     directions = np.eye(flat.size)
     if flat.size > 16:
         directions = np.linalg.qr(np.random.default_rng(0).standard_normal((flat.size, 16)))[0].T
