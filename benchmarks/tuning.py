@@ -15,8 +15,21 @@ Last answer (2 cores, JAX 0.10, --seed 0), noise:
     consistent  .01 %       1.009 (.902-1.127)          1.011           1.15 1.06
     ap          11.9 %      1.004 (.849-1.179)           .784           1.00  .99
 Both starts end in the same place. The base points' noise, the same in every frame, spreads the NIS of a single
-sequence; A-P has the first image's noise for new in every frame, and its sigma makes up for it. Focal, 4 synthetic
-fits: .007 %. The parts on video have not been run to the end yet.
+sequence; A-P has the first image's noise for new in every frame, and its sigma makes up for it. Focal, 10 synthetic
+fits: worst .014 %. On video, from 10 % too long and too short:
+    aerial +2.3 +.3, chessboard +5.1 +3.2, KITTI -2.0 -1.7, kitchen +4.4 +2.7, Tsukuba +.7 +2.5, temple +1.4 -1.6 %
+(2 % were asked of two: temple alone is within it from both starts, KITTI misses by .04). With another focal length
+other points pass the gate and other frames become keyframes: the likelihood has steps, and where a fit ends depends on
+its start.
+Tracks, the sequence left out; a gain is of the negative log-likelihood per coordinate:
+                 sigma  error  eigenvalue   gain    ATE % before, after   ratio
+    aerial        .97    .36      -.09      1.07      .011  .019          1.66
+    chessboard    .88    .42      -.24       .74      .168  .118           .71
+    KITTI         .91    .46      -.22       .06      .218  .270          1.24
+    kitchen       .91    .48      -.17       .12      .578  .651          1.13
+    Tsukuba       .95    .47      -.18       .36      .111  .144          1.30
+    temple        .90    .47      -.18      -.06      .127  .163          1.29
+The likelihood gains on five of six, the trajectory loses on five of six: hence it is not the tracker's default.
 """
 
 import time
@@ -246,6 +259,7 @@ def video_focal(folder: Path, factor: float, rounds: int = 2, frames: int = 100)
         wrong = scaled(camera, model.focal)
         settings = Settings.of(wrong, noise_px=model.noise_px)
         recording = run(folder, wrong, settings, klt=FEW, max_frames=frames, record=True).odometry.recording()
+        recording = replace(recording, frames=jnp.zeros((1, 1), int))  # not looked at here; of one shape for all
         model = tuning.fit(model, (camera, recording), parameters, loss, max_steps=16).model
     return float(model.focal) - 1
 
@@ -349,7 +363,7 @@ def main() -> None:
     names = [n for n in SEQUENCES if (args.data / n).is_dir()]
     modes, trials = MODES, args.trials
     if args.quick:
-        names, modes, trials = [], MODES[:1], 2
+        args.parts, modes, trials = ["noise"], MODES[:1], 2
     began = time.perf_counter()
 
     if "noise" in args.parts:
@@ -367,7 +381,7 @@ def main() -> None:
             plot(after, args.plots / "tuned_nis.png")
 
     if "focal" in args.parts:
-        errors = synthetic_focal(args.seed, 1 if args.quick else max(trials // 4, 1))
+        errors = synthetic_focal(args.seed, max(trials // 4, 1))
         figures["focal_relative_error"] = max(map(abs, errors))
         print(
             f"\nfocal length, synthetic, of {len(errors)} fits: worst {figures['focal_relative_error']:.3%}", flush=True
@@ -380,6 +394,7 @@ def main() -> None:
             figures[f"{name}.focal_relative_error"] = max(map(abs, found))
             rows.append([name, *(f"{e:+.1%}" for e in found)])
             print(f"  {rows[-1]}", flush=True)
+            jax.clear_caches()  # a process may map only so many pieces of compiled code
         print("\nfocal length on video\n" + table(["sequence", "from +10 %", "from -10 %"], rows), flush=True)
 
     if "tracks" in args.parts and len(names) > 1:

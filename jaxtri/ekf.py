@@ -300,7 +300,7 @@ def information(
     weight zero count nothing. `noise_scale` as of `update`.
     """
     mask = weights > 0
-    items, noise_scale = stand_in(mask, items), stand_in(mask, noise_scale)
+    items, noise_scale = stand_in(mask, items), replace_masked(mask, noise_scale, 1.0)
     observed = jax.vmap(lambda item: model.measure(mean, item))(items)
     d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
     lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask, noise_scale)
@@ -337,7 +337,7 @@ def update(
     """
     P, prior = belief.covariance, belief.mean
     dtype = P.dtype
-    items, noise_scale = stand_in(mask, items), stand_in(mask, noise_scale)
+    items, noise_scale = stand_in(mask, items), replace_masked(mask, noise_scale, 1.0)
     observed = replace_masked(mask, observed, 0.0)
     valid = mask.astype(dtype)
 

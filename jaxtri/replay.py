@@ -149,12 +149,9 @@ def negative_log_likelihood(camera: Camera, recording: Recording, report: Report
     """
     said, pixels = report.diagnostics, recording.pixels
     at = jnp.arange(1, len(pixels)) if said.used.ndim == 1 else jnp.maximum(recording.frames, 0)
-    log_det = -jnp.log(camera.fx * camera.fy)
-    if camera.distortion is not None:
-        flat = pixels.reshape(-1, 2)
-        flat = jnp.where(recording.visible.reshape(-1, 1), flat, jnp.stack([camera.cx, camera.cy]))
-        log_det = jnp.linalg.slogdet(jax.vmap(jax.jacfwd(camera.to_normalised))(flat))[1]
-        log_det = log_det.reshape(pixels.shape[:2])[at]
+    # By the projection's derivative: that of its inverse, `undistort`, could not be differentiated once more.
+    u = recording.normalised(camera)[at]
+    log_det = -jnp.linalg.slogdet(jax.vmap(jax.jacfwd(camera.to_pixels))(u.reshape(-1, 2)))[1].reshape(u.shape[:-1])
     width = 2 * camera.cx if camera.width is None else jnp.asarray(camera.width)
     height = 2 * camera.cy if camera.height is None else jnp.asarray(camera.height)
     outside = (said.measured - said.used).astype(pixels.dtype)

@@ -91,7 +91,7 @@ def fit(
 
     The solver is BFGS by default. The first start is the model itself, further ones are drawn about it with the
     standard deviation `spread` (of the logarithm, where that is fitted). The gradient is taken in forward mode
-    for up to four numbers and in reverse for more, or as `forward` says. Far from the best the slope of a likelihood
+    for a single number and in reverse for more, or as `forward` says. Far from the best the slope of a likelihood
     is steep: the loss is scaled down where the first step along it would be longer than `first_step`. Host only.
 
     Raises `InputError` where a parameter cannot be fitted as it stands or the loss at the start is not finite.
@@ -108,7 +108,7 @@ def fit(
     if not math.isfinite(before):
         raise InputError(f"the loss at the start is {before}: begin with larger noises, or look for NaN in the data")
     count = sum(x.size for x in leaves.values())
-    options = {"autodiff_mode": "fwd" if (count <= 4 if forward is None else forward) else "bwd"}
+    options = {"autodiff_mode": "fwd" if (count == 1 if forward is None else forward) else "bwd"}
     solver = optx.BFGS(rtol=1e-6, atol=1e-6) if solver is None else solver
     found, best, steps, key = None, math.inf, 0, jax.random.key(seed)
 

@@ -99,7 +99,12 @@ def refine(
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
     solution = optx.least_squares(residuals, solver, jnp.zeros(5, dtype), max_steps=max_steps, throw=False)
-    x = solution.value
+    # One Newton step from where it ended, which is not differentiated, has the derivatives of the minimum, and what
+    # the tolerance left open does not spread in differences of the result.
+    x = jax.lax.stop_gradient(solution.value)
+    slope = jax.grad(lambda y: jnp.sum(jnp.square(residuals(y, None))) / 2)
+    step = jnp.linalg.solve(jax.lax.stop_gradient(jax.jacfwd(slope)(x)), slope(x))
+    x = x - jnp.where(jnp.all(jnp.isfinite(step)), step, 0)
     J = jax.jacfwd(lambda y: residuals(y, None))(x)
     A = J.T @ J
     s = 1 / jnp.sqrt(jnp.where(jnp.diagonal(A) > 0, jnp.diagonal(A), 1))

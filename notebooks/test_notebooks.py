@@ -1,5 +1,7 @@
-"""Runs every notebook from top to bottom; the outputs that are kept are not touched."""
+"""Runs every notebook from top to bottom, those that can in a short form; the outputs that are kept are not touched."""
 
+import os
+from importlib.metadata import version
 from pathlib import Path
 
 import nbformat
@@ -7,6 +9,10 @@ import pytest
 from nbclient import NotebookClient
 
 HERE = Path(__file__).parent
+
+os.environ["JAXTRI_SHORT"] = "1"  # read by the notebooks, which inherit it
+if version("jaxlib").startswith("0.10."):  # compiles faster; an unknown flag would end the process
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 
 @pytest.mark.parametrize("path", sorted(HERE.glob("*.ipynb")), ids=lambda p: p.stem)

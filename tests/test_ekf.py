@@ -228,6 +228,19 @@ def test_update_equals_the_dense_iterated_filter(passes):
     np.testing.assert_allclose(diagnostics.nis, expected[3], rtol=1e-6)
 
 
+def test_a_blank_frame_with_noise_scales_has_a_gradient_of_zero():
+    model, belief = sextant()
+    landmarks, observed, mask, _ = sextant_frames()
+
+    def loss(sigma, mask):
+        told = eqx.tree_at(lambda m: m.sigma, model, sigma)
+        says = update(told, belief, landmarks, observed[0], mask, noise_scale=jnp.full(mask.shape, 2.0))
+        return says[1].log_likelihood + jnp.trace(says[0].covariance)
+
+    assert jax.grad(loss)(model.sigma, jnp.asarray(mask[0])) != 0
+    assert jax.grad(loss)(model.sigma, jnp.zeros(mask[0].shape, bool)) == 0
+
+
 @pytest.mark.parametrize("m", [1, 2])
 def test_noise_scales_and_the_likelihood_after_robust_weights(m):
     """A scaled noise is another noise; every item that is used counts in full, about the robust estimate."""

@@ -12,6 +12,7 @@ from jaxtri.bases import Base, StartSettings
 from jaxtri.ekf import Diagnostics
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.geometry.camera import BrownConrady, Camera
+from jaxtri.models.point_noise import PointNoise
 from jaxtri.odometry import Odometry
 from jaxtri.pipeline import follow_tracks
 from jaxtri.scan import checkpointed
@@ -31,15 +32,16 @@ def live(base, overlap=1):
     return odometry, odometry.recording()
 
 
-def scaled(log_factors):
-    """Camera and settings, the focal length and what a user may tune multiplied."""
-    f = jnp.exp(log_factors)
-    camera = eqx.tree_at(lambda c: (c.fx, c.fy), TRACKS.camera, (TRACKS.camera.fx * f[0], TRACKS.camera.fy * f[0]))
+def told(x):
+    """Camera and settings: focal length, noises and robust scale multiplied by exp(x), a lens, noise by quality."""
+    f, lens, exponents = jnp.exp(x[:5]), BrownConrady(jnp.pad(x[5:10], (0, 3))), PointNoise(x[10], x[11])
+    camera = dataclasses.replace(TRACKS.camera, fx=TRACKS.camera.fx * f[0], fy=TRACKS.camera.fy * f[0], distortion=lens)
 
     def tuned(s):
         return s.sigma, s.acceleration, s.angular_acceleration, s.robust.scale
 
-    return camera, eqx.tree_at(tuned, SETTINGS, tuple(x * y for x, y in zip(tuned(SETTINGS), f[1:], strict=True)))
+    settings = eqx.tree_at(tuned, SETTINGS, tuple(x * y for x, y in zip(tuned(SETTINGS), f[1:], strict=True)))
+    return camera, dataclasses.replace(settings, point_noise=exponents)
 
 
 def agrees(odometry, recording, report):
@@ -47,10 +49,10 @@ def agrees(odometry, recording, report):
     measured = np.asarray(recording.frames)
     if report.covariance.ndim == 3:
         measured = np.arange(1, len(recording.pixels))
-    told = [odometry.poses[odometry.base_pair[0] + k] for k in measured[measured >= 0]]
+    said = [odometry.poses[odometry.base_pair[0] + k] for k in measured[measured >= 0]]
     poses, covariances = (np.asarray(x)[measured >= 0] for x in (report.pose.as_matrix(), report.covariance))
-    np.testing.assert_allclose(poses, np.stack([p.T_camera_world for p in told]), atol=1e-9)
-    np.testing.assert_allclose(covariances, np.stack([p.covariance for p in told]), atol=1e-11)
+    np.testing.assert_allclose(poses, np.stack([p.T_camera_world for p in said]), atol=1e-9)
+    np.testing.assert_allclose(covariances, np.stack([p.covariance for p in said]), atol=1e-11)
 
 
 @pytest.mark.parametrize("base", [Base.TRACKS, Base.INHERIT])
@@ -63,18 +65,20 @@ def test_a_replay_is_the_run(base):
 def test_the_gradient_through_a_restart_is_that_of_differences():
     """With the hand-over of the scale, from the intrinsics to the poses and the likelihood."""
     odometry, recording = live(Base.PAPER, overlap=2)
+    rng = np.random.default_rng(0)
+    quality = np.exp(rng.normal(size=recording.quality.shape)) * [0.1, 0.03]
+    recording = dataclasses.replace(recording, quality=jnp.asarray(quality))
 
     def loss(x):
-        camera, settings = scaled(x)
+        camera, settings = told(x)
         report = replay.pairs(camera, settings, recording)
         return replay.negative_log_likelihood(camera, recording, report), report
 
     value = jax.jit(jax.value_and_grad(loss, has_aux=True))
-    (_, report), slope = value(jnp.zeros(5))
+    (_, report), slope = value(jnp.zeros(12))
     agrees(odometry, recording, report)
-    h = 1e-4
-    steps = jnp.asarray(h * np.eye(5))
-    differences = [(value(s)[0][0] - value(-s)[0][0]) / (2 * h) for s in steps]
+    h = 2e-5
+    differences = [(value(s)[0][0] - value(-s)[0][0]) / (2 * h) for s in h * jnp.eye(12)]
     np.testing.assert_allclose(slope, differences, atol=1e-5 * np.linalg.norm(differences))
     assert (np.abs(differences) > 1e-4 * np.linalg.norm(differences)).all()
 
