@@ -6,9 +6,14 @@ The paper's experiment, 99 frames of 300 points; the gradient with respect to si
 and `forward` are modes of differentiation; `block` is the frames between two kept beliefs (`jaxtri.scan`). Times are
 medians over interleaved runs, memory is what the compiler sets aside beside arguments and results.
 
-Last answer (2 cores, JAX 0.10, of `default` with `block` 1, other load beside): run .10 s, reverse gradient .67 s, 6.8
-times (5 asked), 2.5 MB, compiled in 19 s. Of these 6.8 the run itself is one, and two more are runs done again: what
-happens in a frame and in a pass is not kept.
+Last answer (2 idle cores, JAX 0.10), 99 frames and `block` 1:
+
+mode        run     reverse over run  forward over run  reverse MB  reverse compiled in
+default     106 ms        6.1               5.8             2.5           19 s
+consistent  286 ms        4.6               5.3              25           49 s
+
+5 times and 20 s are asked. Of the 6.1 the run itself is one, and two more are runs done again: what happens in a frame
+and in a pass is not kept. Of 990 frames: 6.3 times and 8.9 MB, with `block` 10 5.6 times and 6.6 MB.
 """
 
 import time

@@ -155,11 +155,13 @@ def follow(mode: str, told: Noise, tracks: Tracks) -> ekf.Diagnostics:
     return schmidt.filter(model, belief, pairs, later, mask, passes=2)[1]
 
 
-def noise(mode: str, seed: int, trials: int, training: int = 4) -> tuple[dict[str, float], np.ndarray]:
+def noise(
+    mode: str, seed: int, trials: int, training: int = 4, frames: int = 50
+) -> tuple[dict[str, float], np.ndarray]:
     """Figures of a mode, and the NIS of the fresh sequences, (start, trial)."""
     points = 40 if mode == "ap" else 100
     key, fresh = jax.random.split(jax.random.key(seed))
-    draw = jax.jit(lambda keys: jax.lax.map(lambda k: walk(k, points, 50), keys))
+    draw = jax.jit(lambda keys: jax.lax.map(lambda k: walk(k, points, frames), keys))
     data, new = draw(jax.random.split(key, training)), draw(jax.random.split(fresh, trials))
     nis = jax.jit(lambda m, d: jax.lax.map(lambda x: tuning.nis_per_component(follow(mode, m, x)), d))
 
@@ -369,7 +371,7 @@ def main() -> None:
     if "noise" in args.parts:
         rows, after = [], {}
         for mode in modes:
-            said, after[mode] = noise(mode, args.seed, trials, 1 if args.quick else 4)
+            said, after[mode] = noise(mode, args.seed, trials, *((1, 25) if args.quick else ()))
             figures |= {(k if mode == "default" else f"{mode}.{k}"): v for k, v in said.items()}
             rows.append([mode, f"{said['sigma_relative_error']:.2%}", *(f"{v:.3f}" for v in list(said.values())[1:])])
         head = ["mode", "sigma off", "NIS", "lowest", "highest", "with the truth", "acc / true", "ang acc / true"]
