@@ -34,14 +34,14 @@ def live(base, overlap=1):
 
 def told(x):
     """Camera and settings: focal length, noises and robust scale multiplied by exp(x), a lens, noise by quality."""
-    f, lens, exponents = jnp.exp(x[:5]), BrownConrady(jnp.pad(x[5:10], (0, 3))), PointNoise(x[10], x[11])
+    f, lens, added = jnp.exp(x[:5]), BrownConrady(jnp.pad(x[5:10], (0, 3))), PointNoise(x[10] + 0.3, x[11] + 0.2)
     camera = dataclasses.replace(TRACKS.camera, fx=TRACKS.camera.fx * f[0], fy=TRACKS.camera.fy * f[0], distortion=lens)
 
     def tuned(s):
         return s.sigma, s.acceleration, s.angular_acceleration, s.robust.scale
 
     settings = eqx.tree_at(tuned, SETTINGS, tuple(x * y for x, y in zip(tuned(SETTINGS), f[1:], strict=True)))
-    return camera, dataclasses.replace(settings, point_noise=exponents)
+    return camera, dataclasses.replace(settings, point_noise=added)
 
 
 def agrees(odometry, recording, report):

@@ -309,10 +309,11 @@ class TestSegments:
 
 
 def test_a_points_noise_follows_its_quality():
-    """1 where a figure is unknown or the exponents are zero, without a NaN gradient; no more than 30 times off."""
+    """1 where a figure is unknown or counts nothing, without a NaN gradient; ratios no more than 30."""
     quality = jnp.asarray([[0.1, 0.03], [1.0, 0.03], [0.1, 0.0003], [0.0, 1e9], [jnp.nan, 1.0], [1.0, jnp.nan]])
-    noise = PointNoise(jnp.asarray(0.5), jnp.asarray(-0.25))
-    expected = [1, 10**0.5, 30**0.25, 30**-0.5 * 30**-0.25, 1, 1]
+    noise = PointNoise(jnp.asarray(0.5), jnp.asarray(0.25))
+    variances = np.array([1.75, 1 + 50 + 0.25, 1 + 0.5 + 0.25 * 30, 1 + 0.5 / 900 + 0.25 / 30, 1.75, 1.75])
+    expected = np.sqrt(variances / 1.75)
     np.testing.assert_allclose(noise.scale(quality), expected, rtol=1e-12)
     np.testing.assert_array_equal(PointNoise().scale(quality), 1)
     slope = jax.grad(lambda n: jnp.sum(n.scale(quality)))(noise)

@@ -6,24 +6,27 @@ from jaxtyping import Array, Float
 
 from jaxtri.ekf import number
 
-# About the medians of the tracker's figures on video: where the noise is sigma.
+# About the medians of the tracker's figures on video.
 _ERROR_PX = 0.1
 _EIGENVALUE = 0.03
 
 
 class PointNoise(eqx.Module):
-    """Standard deviation of a point's noise over sigma: a power of each of the tracker's figures.
+    """Variance of a point's noise: a constant, and what each of the tracker's figures adds to it.
 
-    (error / 0.1 px) ** a * (eigenvalue / 0.03) ** b, both ratios kept between 1/30 and 30; 1 where a figure is not
-    known. All zero, the default, is the same noise for all.
+    Over sigma^2, which is that of a point with the usual figures, (1 + a (error / 0.1 px)^2 + b (0.03 / eigenvalue)) /
+    (1 + a + b), both ratios kept between 1/30 and 30: the noise of the image moves a point by a variance that goes with
+    the inverse of the eigenvalue. 1 where a figure is not known, and for all by default. The constant keeps a point
+    that came back by luck from ruling all others, and from being given up when the luck ends.
     """
 
     error: Float[Array, ""] = eqx.field(default=0.0, converter=number)  # a; forward-backward error
-    eigenvalue: Float[Array, ""] = eqx.field(default=0.0, converter=number)  # b; of the patch's gradient matrix
+    eigenvalue: Float[Array, ""] = eqx.field(default=0.0, converter=number)  # b; smaller one of the gradient matrix
 
     def scale(self, quality: Float[Array, "n 2"]) -> Float[Array, " n"]:
-        """Of points whose forward-backward errors (pixels) and smaller eigenvalues are given."""
+        """Standard deviation over sigma, of points whose errors (pixels) and eigenvalues are given."""
         ratio = quality / jnp.array([_ERROR_PX, _EIGENVALUE], quality.dtype)
         known = jnp.isfinite(ratio).all(axis=1)
-        error, eigenvalue = jnp.log(jnp.clip(jnp.where(known[:, None], ratio, 1.0), 1 / 30, 30)).T
-        return jnp.exp(self.error.astype(error.dtype) * error + self.eigenvalue.astype(error.dtype) * eigenvalue)
+        error, eigenvalue = jnp.clip(jnp.where(known[:, None], ratio, 1.0), 1 / 30, 30).T
+        a, b = self.error.astype(error.dtype), self.eigenvalue.astype(error.dtype)
+        return jnp.sqrt(jnp.where(known, (1 + a * error**2 + b / eigenvalue) / (1 + a + b), 1.0))
