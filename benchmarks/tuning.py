@@ -21,15 +21,18 @@ fits: worst .014 %. On video, from 10 % too long and too short:
 (2 % were asked of two: temple alone is within it from both starts, KITTI misses by .04). With another focal length
 other points pass the gate and other frames become keyframes: the likelihood has steps, and where a fit ends depends on
 its start.
-Tracks, the sequence left out; a gain is of the negative log-likelihood per coordinate:
-                 sigma  error  eigenvalue   gain    ATE % before, after   ratio
-    aerial        .97    .36      -.09      1.07      .011  .019          1.66
-    chessboard    .88    .42      -.24       .74      .168  .118           .71
-    KITTI         .91    .46      -.22       .06      .218  .270          1.24
-    kitchen       .91    .48      -.17       .12      .578  .651          1.13
-    Tsukuba       .95    .47      -.18       .36      .111  .144          1.30
-    temple        .90    .47      -.18      -.06      .127  .163          1.29
-The likelihood gains on five of six, the trajectory loses on five of six: hence it is not the tracker's default.
+Tracks, the sequence left out; a gain is of the negative log-likelihood per coordinate; ATE over four starts:
+                 sigma  error  eigenvalue   gain    ATE % before, after   ratio +- standard error
+    aerial        .64    .62       .18       .68      .013  .014          1.11 +- .07
+    chessboard    .42   1.39       .19       .54      .154  .186          1.21 +- .17
+    KITTI         .46    .11       .10      -.14      .224  .207           .93 +- .11
+    kitchen       .46    .11       .10       .02      .666  .690          1.04 +- .11
+    Tsukuba       .54    .14       .11       .23      .125  .117           .94 +- .18
+    temple        .49    .17       .11      -.25      .272  .158           .58 +- .32
+The likelihood gains on four of six (16 steps, in which the fits do not converge: sigma falls first, and one sigma
+does not suit all). The ATE is .94 times what it was in the geometric mean, and on none of them changed by two standard
+errors. Powers of the figures instead of a sum gained on five of six (.06 to 1.07, temple -.06), but let a point that
+came back by luck rule, and be given up when its luck ended: ATE 1.13 to 1.66 times on five of six, one run each.
 """
 
 import time
