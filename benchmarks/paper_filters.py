@@ -164,6 +164,7 @@ def _trifocal(e: Experiment, view: TwoView, method: str, frames: float) -> Filte
     model = Trifocal(e.sigma, *motion, view.translation, mode.base_noise, mode.refine_base)
     pairs = jnp.concatenate([first, second], axis=-1)
     mask = informative(belief.mean, pairs, e.sigma, SMALLEST_SNR)
+    items = pairs if consistent else ekf.prepare(model, pairs, mask)
     depth = Depth.paper(e.sigma, inverse=True) if paper else Depth.of(e.sigma)
     scale = scale_variance(view, first, second, mask, e.sigma)
     everything = jnp.ones(len(first), bool)
@@ -177,7 +178,7 @@ def _trifocal(e: Experiment, view: TwoView, method: str, frames: float) -> Filte
     def step(carry: tuple[Any, Bank | None], z: Array) -> tuple[tuple[Any, Bank | None], ekf.Diagnostics]:
         belief, bank = carry
         filter_ = schmidt if consistent else ekf
-        belief, said = filter_.step(model, belief, pairs, z, mask, passes=mode.passes)
+        belief, said = filter_.step(model, belief, items, z, mask, passes=mode.passes)
         if bank is None:
             return (belief, None), said
         pose, C = belief.mean.motion.pose, belief.mean.motion.pose_covariance(covariance(belief))

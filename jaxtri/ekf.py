@@ -5,13 +5,17 @@ the manifold and the measurement of one item; the update sums over N items and n
 covariance of all of them. Nothing here knows of cameras.
 """
 
+from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxtri import moments
+from jaxtri.moments import Moments, Projective
 from jaxtri.scan import checkpointed
 
 Mean = TypeVar("Mean")
@@ -111,11 +115,48 @@ class Diagnostics(eqx.Module):
     distance: Float[Array, " n"]
 
 
+@runtime_checkable
+class Evidence(Protocol):
+    """What a frame's measurements say at one state, in the s components of the error that they depend on."""
+
+    log_det: Float[Array, " n"]  # of the noise of each item, zero where masked
+
+    @property
+    def distance(self) -> Float[Array, " n"]:
+        """Squared Mahalanobis distance of the residual of each item, zero where masked."""
+        ...
+
+    def distance_after(self, step: Float[Array, " s"]) -> Float[Array, " n"]:
+        """The same after a step of the error, by the linearisation."""
+        ...
+
+    def normal_equations(self, weights: Float[Array, " n"]) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+        """A = sum w H' D^-1 H and sum w H' D^-1 r: all that the items say, in s numbers."""
+        ...
+
+
 class _Linearisation(eqx.Module):
+    """The plain form: a residual, a Jacobian and a noise for each item."""
+
     residual: Float[Array, "n m"]
     jacobian: Float[Array, "n m d"]
     whitener: Float[Array, "n m m"]  # W with W' W = inverse noise
     log_det: Float[Array, " n"]
+
+    @property
+    def distance(self) -> Array:
+        return jnp.sum(jnp.einsum("nij,nj->ni", self.whitener, self.residual) ** 2, axis=-1)
+
+    def distance_after(self, step: Array) -> Array:
+        left = self.residual - jnp.einsum("nmd,d->nm", self.jacobian, step)
+        return jnp.sum(jnp.einsum("nij,nj->ni", self.whitener, left) ** 2, axis=-1)
+
+    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
+        root = safe_root(weights)[:, None]
+        H = jnp.einsum("nij,njd->nid", self.whitener, self.jacobian) * root[..., None]
+        r = jnp.einsum("nij,nj->ni", self.whitener, self.residual) * root
+        H = H.reshape(-1, H.shape[-1])
+        return H.T @ H, H.T @ r.reshape(-1)
 
 
 def whiten(D: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[Array, ""]]:
@@ -177,19 +218,38 @@ def _linearise(
     return _Linearisation(*whitened)
 
 
+def prepare(model: Model[Mean], items: PyTree[Array], mask: Bool[Array, " n"]) -> PyTree[Array]:
+    """The items in the form in which `update` sums over them, where the model has one (`jaxtri.moments`).
+
+    Made once for all frames in which a part of those in `mask` is seen: a frame then costs less. What is prepared
+    already, and the items of other models, come back as they are.
+    """
+    if isinstance(items, Moments) or not isinstance(model, Projective):
+        return items
+    return moments.prepare(model, stand_in(mask, items))
+
+
+def _measuring(
+    model: Model[Mean], d: int, items: PyTree, mask: Bool[Array, " n"]
+) -> tuple[Callable[..., Evidence], np.ndarray]:
+    """A frame's evidence as a function of prior, error, observations, mask and noise scale; and the error's support."""
+    items = prepare(model, items, mask)
+    if isinstance(items, Moments):
+        assert isinstance(model, Projective)
+        support = np.arange(d) if model.support is None else model.support
+
+        def at(prior: Mean, delta: Array, observed: Array, mask: Array, scale: Array | None) -> Evidence:
+            return moments.linearise(model, prior, delta, items, observed, mask, scale, support)
+
+        return at, support
+    items = stand_in(mask, items)
+    return lambda prior, delta, *frame: _linearise(model, prior, delta, items, *frame), np.arange(d)
+
+
 def safe_root(weights: Float[Array, " n"]) -> Float[Array, " n"]:
     """Square root with a zero derivative at the zero of a masked item."""
     positive = weights > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, weights, 1.0)), 0.0)
-
-
-def _normal_equations(lin: _Linearisation, weights: Array, delta: Array) -> tuple[Array, Array]:
-    """A = sum w H' D^-1 H and b = sum w H' D^-1 (r + H delta): all that the items say, in d numbers."""
-    root = safe_root(weights)[:, None]
-    H = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian) * root[..., None]
-    r = jnp.einsum("nij,nj->ni", lin.whitener, lin.residual) * root
-    H, r = H.reshape(-1, H.shape[-1]), r.reshape(-1)
-    return H.T @ H, H.T @ (r + H @ delta)
 
 
 def scales(P: Float[Array, "d d"]) -> Float[Array, " d"]:
@@ -211,69 +271,90 @@ def regression(P: Float[Array, "d d"], cross: Float[Array, "d e"]) -> Float[Arra
     return (found / s[:, None]).T
 
 
-def _system(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
-    """I + P A, P and A in coordinates scaled by the prior's standard deviations, and these.
+_Factors = tuple[Float[Array, "s s"], Int[Array, " s"]]
 
-    Without scaling float32 does not survive; A alone is never inverted (a scale it does not see leaves it
-    rank deficient), nor is P (a pinned direction has no uncertainty).
+
+class _Prior(NamedTuple):
+    """A prior covariance P, to be corrected by an A that is zero but for the rows and columns of the support.
+
+    In coordinates scaled by the prior's standard deviations: without, float32 does not survive. A alone is never
+    inverted (a scale it does not see leaves it rank deficient), nor is P (a pinned direction has no uncertainty),
+    but I + A P of the support, whose factors are handed on.
     """
-    s = scales(P)
-    Ps, As = P / jnp.outer(s, s), A * jnp.outer(s, s)
-    return jnp.eye(s.size, dtype=P.dtype) + Ps @ As, Ps, As, s
+
+    P: Float[Array, "d d"]
+    rows: Float[Array, "s d"]  # of P
+    scales: Float[Array, " d"]
+    support: np.ndarray  # (s,)
+
+    @classmethod
+    def of(cls, P: Float[Array, "d d"], support: np.ndarray) -> "_Prior":
+        s = scales(P)
+        P = P / jnp.outer(s, s)
+        return cls(P, P[support], s, support)
+
+    def _scaled(self, A: Float[Array, "s s"]) -> Float[Array, "s s"]:
+        s = self.scales[self.support]
+        return A * jnp.outer(s, s)
+
+    def factors(self, A: Float[Array, "s s"]) -> _Factors:
+        M = jnp.eye(len(A), dtype=A.dtype) + self._scaled(A) @ self.rows[:, self.support]
+        return jax.scipy.linalg.lu_factor(M)
+
+    def error(self, factors: _Factors, b: Float[Array, " s"]) -> Float[Array, " d"]:
+        """(P^-1 + A)^-1 b."""
+        return jax.scipy.linalg.lu_solve(factors, b * self.scales[self.support]) @ self.rows * self.scales
+
+    def posterior(self, A: Float[Array, "s s"], factors: _Factors) -> tuple[Float[Array, "d d"], Float[Array, ""]]:
+        """(P^-1 + A)^-1, and log det (I + P A).
+
+        With G = P (I + A P)^-1 the former is P - G A P. Written as a sum of squares,
+        (I - G A) P (I - G A)' + G A G', which is Joseph's form, it stays positive when G is off by rounding: in
+        float32 the difference does not.
+        """
+        A, d = self._scaled(A), len(self.P)
+        G = self.rows.T @ jax.scipy.linalg.lu_solve(factors, jnp.eye(len(A), dtype=A.dtype))
+        GA = G @ A
+        left = jnp.eye(d, dtype=A.dtype) - moments.embed(GA, self.support, d)
+        covariance = left @ self.P @ left.T + GA @ G.T
+        log_det = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(factors[0]))))
+        return (covariance + covariance.T) / 2 * jnp.outer(self.scales, self.scales), log_det
 
 
 def posterior_error(P: Float[Array, "d d"], A: Float[Array, "d d"], b: Float[Array, " d"]) -> Float[Array, " d"]:
     """(P^-1 + A)^-1 b, for a P that may be singular."""
-    M, Ps, _, s = _system(P, A)
-    return jnp.linalg.solve(M, Ps @ (b * s)) * s
-
-
-def _posterior(P: Array, A: Array) -> tuple[Array, Array]:
-    """Covariance of the posterior error, (P^-1 + A)^-1, and log det (I + P A).
-
-    With X = (I + P A)^-1 the covariance is X P. Written as a sum of squares, X P X' + (X P) A (X P)', which is
-    Joseph's form, it stays positive when X is off by rounding: in float32 X P itself does not.
-    """
-    M, Ps, As, s = _system(P, A)
-    eye = jnp.eye(s.size, dtype=P.dtype)
-    # What is known exactly stays so: a variance of rounding would be a scale to all that divides by it.
-    X = jnp.where(jnp.diagonal(P)[:, None] > 0, jnp.linalg.solve(M, eye), eye)
-    XP = X @ Ps
-    covariance = XP @ X.T + XP @ As @ XP.T
-    return (covariance + covariance.T) / 2 * jnp.outer(s, s), jnp.linalg.slogdet(M)[1]
+    prior = _Prior.of(P, np.arange(len(P)))
+    return prior.error(prior.factors(A), b)
 
 
 class _Pass(NamedTuple):
-    """One pass of an update: where it linearised, what it found there, and the error that is best by it."""
+    """What one pass of an update found, no more than is needed after it: a loop is slow to hand on much."""
 
-    delta: Float[Array, " d"]
-    lin: _Linearisation
+    optimal: Float[Array, " d"]  # the error that is best by it
+    A: Float[Array, "s s"]
+    factors: _Factors
     weights: Float[Array, " n"]
     used: Bool[Array, " n"]
-    A: Float[Array, "d d"]
-    b: Float[Array, " d"]
-    optimal: Float[Array, " d"]
-
-
-def _distance(lin: _Linearisation) -> Array:
-    return jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, lin.residual) ** 2, axis=-1)
-
-
-def _moved(lin: _Linearisation, step: Array) -> _Linearisation:
-    """The residuals that the linearisation leaves after a step of the error."""
-    residual = lin.residual - jnp.einsum("nmd,d->nm", lin.jacobian, step)
-    return _Linearisation(residual, lin.jacobian, lin.whitener, lin.log_det)
+    distance: Float[Array, " n"]  # of the items once the error is corrected
+    log_det: Float[Array, ""]  # of the noise of the items used
+    nis: Float[Array, ""]
 
 
 def unless_overflown(
     prior: Taken, posterior: Taken, diagnostics: Diagnostics
 ) -> tuple[Taken, Diagnostics, Bool[Array, ""]]:
     """The posterior and its diagnostics, or where any number of these is not finite the prior; and whether all are."""
-    finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves((posterior, diagnostics))]).all()
+    numbers = [x.ravel() for x in jax.tree.leaves((posterior, diagnostics)) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    finite = jnp.isfinite(jnp.concatenate(numbers)).all()
     belief = jax.tree.map(lambda new, old: jnp.where(finite, new, old), posterior, prior)
     nothing = jax.tree.map(lambda x: jnp.where(finite, x, 0), diagnostics)
     unlikely = jnp.where(finite, diagnostics.log_likelihood, -jnp.inf)
     return belief, eqx.tree_at(lambda d: d.log_likelihood, nothing, unlikely), finite
+
+
+def _nearby(model: Dynamics[Mean], mean: Mean, other: Mean) -> Float[Array, " d"]:
+    """`model.local`, or what has the same derivative where the two coincide."""
+    return getattr(model, "difference", model.local)(mean, other)
 
 
 def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
@@ -281,7 +362,7 @@ def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float
     after = model.predict(mean, dt)
 
     def error(delta: Array) -> Array:
-        return model.local(after, model.predict(model.retract(mean, delta), dt))
+        return _nearby(model, after, model.predict(model.retract(mean, delta), dt))
 
     noise = model.process_noise(mean, dt)
     return jax.jacfwd(error)(jnp.zeros(noise.shape[0], noise.dtype))
@@ -304,7 +385,7 @@ def information(
     observed = jax.vmap(lambda item: model.measure(mean, item))(items)
     d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
     lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask, noise_scale)
-    A, _ = _normal_equations(lin, weights, jnp.zeros(d, weights.dtype))
+    A, _ = lin.normal_equations(weights)
     whitened = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian)
     return A, jnp.einsum("n,nid,nij->ndj", weights, whitened, lin.whitener)
 
@@ -335,60 +416,64 @@ def update(
     With `robust`, the passes before the last bring the weights down; eight or nine are needed. `noise_scale` is the
     standard deviation of each item's noise over what the model says, where something more is known of it.
     """
-    P, prior = belief.covariance, belief.mean
-    dtype = P.dtype
-    items, noise_scale = stand_in(mask, items), replace_masked(mask, noise_scale, 1.0)
-    observed = replace_masked(mask, observed, 0.0)
-    valid = mask.astype(dtype)
-
-    def weigh(lin: _Linearisation, k: Array) -> Array:
-        return valid if robust is None else valid * robust.weights(_distance(lin), k, passes)
-
+    P, mean = belief.covariance, belief.mean
+    dtype, d = P.dtype, P.shape[0]
+    linearise, support = _measuring(model, d, items, mask)
+    noise_scale, observed = replace_masked(mask, noise_scale, 1.0), replace_masked(mask, observed, 0.0)
+    valid, prior = mask.astype(dtype), _Prior.of(P, support)
     considered = getattr(model, "considered", None)
 
     def correct(error: Array) -> Array:
         return error if considered is None else jnp.where(considered, 0.0, error)
 
-    def iterate(k: Array, before: _Pass) -> _Pass:
-        delta = correct(before.optimal)
-        lin = _linearise(model, prior, delta, items, observed, mask, noise_scale)
-        weights, used = weigh(lin, k), mask
+    def iterate(k: Array, before: Array) -> _Pass:
+        delta = correct(before)
+        evidence = linearise(mean, delta, observed, mask, noise_scale)
+        weights, used = valid, mask
         if robust is not None:
-            used = mask & (_distance(lin) < robust.gate.astype(dtype))
+            distance = evidence.distance
+            weights = valid * robust.weights(distance, k, passes)
+            used = mask & (distance < robust.gate.astype(dtype))
             weights = jnp.where((k == passes - 1) & ~used, 0.0, weights)
-        A, b = _normal_equations(lin, weights, delta)
-        return _Pass(delta, lin, weights, used, A, b, posterior_error(P, A, b))
+        A, b = evidence.normal_equations(weights)
+        at = delta[support]
+        b = b + A @ at
+        factors = prior.factors(A)
+        optimal = prior.error(factors, b)
+        # nu' S^-1 nu without S: by the solution's own normal equations, free of cancellation.
+        best = optimal[support]
+        left = distance = evidence.distance_after(best - at)
+        if considered is not None:
+            distance = evidence.distance_after(correct(optimal)[support] - at)
+        nis = jnp.sum(jnp.where(used, left, 0.0)) + best @ (b - A @ best)
+        log_det = jnp.sum(jnp.where(used, evidence.log_det, 0.0))
+        return _Pass(optimal, A, factors, weights, used, distance, log_det, nis)
 
     # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
-    (n, m), d = observed.shape, P.shape[0]
-    zero, square = jnp.zeros(d, dtype), jnp.zeros((d, d), dtype)
-    nothing = _Linearisation(*(jnp.zeros(shape, dtype) for shape in ((n, m), (n, m, d), (n, m, m), (n,))))
-    last = _Pass(zero, nothing, valid, mask, square, zero, zero)
-    last = jax.lax.fori_loop(0, passes, jax.checkpoint(iterate), last)
-    delta, lin, weights, used, A, b, optimal = last
-    covariance, log_det = _posterior(P, A)
+    k, zero = jnp.zeros((), jnp.int32), jnp.zeros(d, dtype)
+    last = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(iterate, k, zero))
+    last = jax.lax.fori_loop(0, passes, lambda k, found: iterate(k, found.optimal), last)
+    optimal, A, factors, weights, used, distance, noise_log_det, nis = last
+    covariance, log_det = prior.posterior(A, factors)
     final = correct(optimal)
     if considered is not None:
         # The gain of all other components is the optimal one, and so is what they have in common with these.
         covariance = jnp.where(jnp.logical_and.outer(considered, considered), P, covariance)
 
-    mean = model.retract(prior, final)
+    moved = model.retract(mean, final)
     # The error now lives at the new mean: carry the covariance there by the derivative of the change of origin.
-    reset = jax.jacfwd(lambda e: model.local(mean, model.retract(prior, final + e)))(jnp.zeros_like(final))
-    posterior = Belief(mean, reset @ covariance @ reset.T)
+    reset = jax.jacfwd(lambda e: _nearby(model, moved, model.retract(mean, final + e)))(jnp.zeros_like(final))
+    posterior = Belief(moved, reset @ covariance @ reset.T)
 
-    # nu' S^-1 nu and log det S without S: by the solution's own normal equations, free of cancellation.
-    quadratic = jnp.sum(jnp.where(used, _distance(_moved(lin, optimal - delta)), 0.0))
-    nis = quadratic + optimal @ (b - A @ optimal)
-    log_det = log_det + jnp.sum(jnp.where(used, lin.log_det, 0.0))
-    constant = m * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
+    log_det = log_det + noise_log_det
+    constant = observed.shape[1] * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
     diagnostics = Diagnostics(
         log_likelihood=-(nis + log_det + constant) / 2,
         nis=nis,
         measured=jnp.sum(mask),
         used=jnp.sum(used),
         weights=weights,
-        distance=_distance(_moved(lin, final - delta)),
+        distance=distance,
     )
     return unless_overflown(belief, posterior, diagnostics)[:2]
 
@@ -428,6 +513,7 @@ def filter(
     """
     if dt is None:
         dt = jnp.ones(observed.shape[0], belief.covariance.dtype)
+    items = prepare(model, items, mask.any(axis=0))
 
     def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
         z, seen, elapsed = frame

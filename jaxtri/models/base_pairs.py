@@ -10,10 +10,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
-from jaxtri.geometry.pose import local, retract
+from jaxtri.geometry.pose import difference, local, matrix, retract
 from jaxtri.geometry.trifocal import point_from_bases, project
 from jaxtri.models.motion import Twist, twist_noise
 
@@ -62,6 +63,10 @@ class BasePairs(eqx.Module):
         """The error that takes `mean` to `other`."""
         return local(mean, other)
 
+    def difference(self, mean: Twist, other: Twist) -> Float[Array, "12"]:
+        """`local`, to first order where the two coincide."""
+        return difference(mean, other)
+
     def predict(self, mean: Twist, dt: Float[Array, ""]) -> Twist:
         """Constant velocity in camera axes."""
         return mean.advance(dt)
@@ -76,6 +81,25 @@ class BasePairs(eqx.Module):
     def measure(self, mean: Twist, item: BasePoint) -> Float[Array, "2"]:
         """The transferred point, normalised."""
         return self._project(mean, item.point)
+
+    # The same measurements as a linear map and a division: `jaxtri.moments`.
+
+    @property
+    def support(self) -> np.ndarray:
+        """The pose, without the twist."""
+        return np.arange(6)
+
+    def matrix(self, mean: Twist) -> Float[Array, "3 4"]:
+        """The camera matrix."""
+        return jnp.concatenate([matrix(mean.pose.rotation()), mean.pose.translation()[:, None]], axis=1)
+
+    def coordinates(self, item: BasePoint) -> Float[Array, "4"]:
+        """The point."""
+        return item.point
+
+    def spread(self, item: BasePoint) -> Float[Array, "4 4"]:
+        """Its derivative with respect to the two base observations."""
+        return item.spread
 
     def lever(self, mean: Twist, item: BasePoint, lever: Float[Array, "4 12"]) -> Float[Array, "2 12"]:
         """Derivative of the transferred point with respect to the errors of its base poses."""

@@ -14,8 +14,10 @@ from jaxtri.geometry.pose import (
     compose,
     euler_from_matrix,
     exp_pose,
+    exp_rotation,
     matrix_from_euler,
     multiply,
+    product,
     rotation_matrix,
     shear,
 )
@@ -41,7 +43,7 @@ class Kinematics(eqx.Module):
         """The state at constant velocity `dt` later."""
         turn = self.angular_velocity * dt
         if isinstance(self.rotation, SO3):
-            rotation = (SO3.exp(turn) @ self.rotation).normalize()
+            rotation = product(exp_rotation(turn), self.rotation)
         else:
             rotation = self.rotation + turn
         return Kinematics(self.translation + self.velocity * dt, self.velocity, rotation, self.angular_velocity)
@@ -83,7 +85,7 @@ class Twist(eqx.Module):
 
     def advance(self, dt: Float[Array, ""]) -> "Twist":
         """The state at constant twist `dt` later."""
-        return Twist(multiply(exp_pose(self.twist * dt), self.pose).normalize(), self.twist)
+        return Twist(multiply(exp_pose(self.twist * dt), self.pose), self.twist)
 
 
 class MotionStart(NamedTuple):

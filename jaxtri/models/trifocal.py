@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtri import schmidt
 from jaxtri.ekf import Belief
-from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import local, retract, rotation_matrix
+from jaxtri.geometry.epipolar import homogeneous, inverse_depth, perpendicular_line, safe_norm
+from jaxtri.geometry.pose import difference, local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
-from jaxtri.models.motion import Kinematics, MotionStart, acceleration_noise, from_two_view
+from jaxtri.models.motion import POSE_ROWS, Kinematics, MotionStart, acceleration_noise, from_two_view
 from jaxtri.schmidt import Measured
 from jaxtri.two_view import TwoView, sensitivity
 
@@ -76,13 +76,19 @@ class Trifocal(eqx.Module):
     def retract(self, mean: TrifocalState, delta: Float[Array, "18"]) -> TrifocalState:
         """The state moved by an error; the length of the base line is the gauge and stays."""
         moved = retract(mean, delta)
-        norm = safe_norm(mean.base_translation)
-        pinned = moved.base_translation * (norm / safe_norm(moved.base_translation))
-        return TrifocalState(moved.motion, pinned, moved.base_rotation)
+        T2 = moved.base_translation
+        before, after = jnp.sum(mean.base_translation**2), jnp.sum(T2 * T2)
+        usable = (before > 0) & (after > 0)
+        stretch = jnp.where(usable, before, 1.0) / jnp.where(usable, after, 1.0)
+        return TrifocalState(moved.motion, T2 * jnp.sqrt(stretch), moved.base_rotation)
 
     def local(self, mean: TrifocalState, other: TrifocalState) -> Float[Array, "18"]:
         """The error that takes `mean` to `other`."""
         return local(mean, other)
+
+    def difference(self, mean: TrifocalState, other: TrifocalState) -> Float[Array, "18"]:
+        """`local`, to first order where the two coincide."""
+        return difference(mean, other)
 
     def predict(self, mean: TrifocalState, dt: Float[Array, ""]) -> TrifocalState:
         """Constant velocity; the base frame stays. Source: Yu et al. 2006, eqs 5 and 10."""
@@ -115,6 +121,28 @@ class Trifocal(eqx.Module):
             J = jax.jacfwd(lambda pair: self._transfer(mean, pair))(item)
             noise = noise + J @ J.T
         return jnp.square(self.sigma) * noise
+
+    # The same measurements as a linear map and a division: `jaxtri.moments`.
+
+    @property
+    def support(self) -> np.ndarray:
+        """The two poses, without the velocity."""
+        return np.concatenate([POSE_ROWS, np.arange(12, 18)])
+
+    def matrix(self, mean: TrifocalState) -> Float[Array, "3 9"]:
+        """The trifocal tensor, over the length of the base line. Source: Yu et al. 2006, eqs 7 and 8."""
+        T2, T = mean.base_translation, mean.motion.translation
+        R2, R = rotation_matrix(mean.base_rotation), mean.motion.R
+        tensor = T2[:, None] * R[:, None] - R2 * T[:, None, None]
+        return tensor.reshape(3, 9) / jnp.maximum(safe_norm(self.epipole), 1e-12)
+
+    def coordinates(self, item: Float[Array, "4"]) -> Float[Array, "9"]:
+        """Products of the line through the second base point and the first, homogeneous."""
+        return jnp.outer(perpendicular_line(item[2:], self.epipole), homogeneous(item[:2])).ravel()
+
+    def spread(self, item: Float[Array, "4"]) -> Float[Array, "9 p"]:
+        """Their derivative with respect to the two base points, with `base_noise`."""
+        return jax.jacfwd(self.coordinates)(item) if self.base_noise else jnp.zeros((9, 0), item.dtype)
 
     def measured(self, mean: TrifocalState, items: Float[Array, "n 4"], moved: Float[Array, "n 4"]) -> Measured:
         """All transferred points, for `jaxtri.schmidt`: the noise of the base points is an error of the items."""
