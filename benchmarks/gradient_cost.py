@@ -8,12 +8,12 @@ medians over interleaved runs, memory is what the compiler sets aside beside arg
 
 Last answer (2 idle cores, JAX 0.10), 99 frames and `block` 1:
 
-mode        run     reverse over run  forward over run  reverse MB  reverse compiled in
-default     106 ms        6.1               5.8             2.5           19 s
-consistent  286 ms        4.6               5.3              25           49 s
+mode        run     reverse over run  reverse MB  reverse compiled in
+default      25 ms        5.2             2.2           18 s
+consistent  286 ms        4.6              25           49 s
 
-5 times and 20 s are asked. Of the 6.1 the run itself is one, and two more are runs done again: what happens in a frame
-and in a pass is not kept. Of 990 frames: 6.3 times and 8.9 MB, with `block` 10 5.6 times and 6.6 MB.
+5 times and 20 s are asked. The row of `consistent` is older than the moment form of `default`, which had 106 ms, 6.1
+times (forward mode 5.8) and 2.5 MB before it; of 990 frames then 6.3 times and 8.9 MB, with `block` 10 5.6 and 6.6 MB.
 """
 
 import time

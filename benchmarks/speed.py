@@ -8,7 +8,8 @@ noise of the base points. `scan` and `default` are one call for all frames, `ste
 run in turns; ratios are medians over the rounds. The answer is checked against the plain form, which takes every
 item's own Jacobian, and against C++.
 
-Last answer: not measured yet on an idle machine.
+Last answer (2 idle cores, JAX 0.10, --quick only): scan 5.3 times C++ at N = 30 and 4.0 at 300 (3 asked; C++ 23 us),
+step 31 and 13 times (9 asked at 300), `default` 2.9 times a single pass, answers apart by 4e-13.
 """
 
 import ctypes
