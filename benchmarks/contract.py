@@ -7,10 +7,15 @@ One file, one question, one command: `--seed`, `--trials` where trials are drawn
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from jaxtri.io import write_json
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jaxtri.io import atomic_path, write_json
 from jaxtri.results import versions
 
 
@@ -45,3 +50,30 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     ]
     lines.insert(1, "  ".join("-" * w for w in widths))
     return "\n".join(lines)
+
+
+def in_turns(runs: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
+    """Seconds of each in each round, after one that is not timed: noise of the machine meets all alike."""
+    for run in runs.values():
+        jax.block_until_ready(run())
+    seconds = {name: np.empty(rounds) for name in runs}
+    for k in range(rounds):
+        for name, run in runs.items():
+            began = time.perf_counter()
+            jax.block_until_ready(run())
+            seconds[name][k] = time.perf_counter() - began
+    return seconds
+
+
+def plot_growth(curves: Mapping[str, Mapping[int, float]], label: str, path: Path) -> None:
+    """Cost against the number of points, on logarithmic axes; `label` is that of the cost."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure, axis = plt.subplots(figsize=(6.5, 4.5), layout="constrained")
+    for name, x in curves.items():
+        axis.loglog(list(x), list(x.values()), "o-", label=name)
+    axis.set(xlabel="points N", ylabel=label)
+    axis.grid(alpha=0.3, which="both")
+    axis.legend()
+    with atomic_path(path) as written:
+        figure.savefig(written, dpi=120)
+    plt.close(figure)

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from contract import parser, report, table
+from contract import in_turns, parser, report, table
 from jaxlie import SO3
 from jaxtyping import Array
 
@@ -83,19 +83,6 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Compiled:
     return Compiled(ready, seconds, float("nan") if memory is None else memory.temp_size_in_bytes / 2**20)
 
 
-def medians(functions: list[Compiled], arguments: tuple, repeats: int) -> list[float]:
-    """Median seconds of each, run in turns."""
-    seconds = np.zeros((repeats, len(functions)))
-    for f in functions:
-        jax.block_until_ready(f.call(*arguments))
-    for row in seconds:
-        for k, f in enumerate(functions):
-            began = time.perf_counter()
-            jax.block_until_ready(f.call(*arguments))
-            row[k] = time.perf_counter() - began
-    return np.median(seconds, axis=0).tolist()
-
-
 def main() -> None:
     options = parser("What does a gradient of the likelihood cost, over the run itself?")
     options.add_argument("--repeats", type=int, default=15)
@@ -119,9 +106,8 @@ def main() -> None:
             if args.quick:
                 del kinds["reverse, block 10"]
             ready = {k: compiled(f, at, data) for k, f in kinds.items()}
-            seconds = dict(
-                zip(ready, medians([*ready.values()], (at, data), repeats if frames <= 99 else 3), strict=True)
-            )
+            runs = {k: partial(f.call, at, data) for k, f in ready.items()}
+            seconds = {k: np.median(x) for k, x in in_turns(runs, repeats if frames <= 99 else 3).items()}
             for k, f in ready.items():
                 ratio = seconds[k] / seconds["run"]
                 rows.append(

@@ -14,19 +14,15 @@ structure 1.05 to 1.15 (1.07), A-P 28 to 36 (1.67), two-step .9 (.27); as publis
 """
 
 import time
-from pathlib import Path
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
-from contract import parser, report, table
+from contract import parser, plot_growth, report, table
 from jaxtyping import Array
 from paper_filters import Trials, draw, start_of
 from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
-
-from jaxtri.io import atomic_path  # noqa: E402
 
 # Names of the figures, methods of `paper_filters`, the paper's seconds.
 SHIPPED = {"pose": "pose", "pose_and_structure": "default", "ap": "ap_good", "two_step": "two_step_good"}
@@ -122,7 +118,8 @@ def main() -> None:
     print(f"\n{time.perf_counter() - began:.0f} s")
     report(args.json, figures)
     if args.plots is not None and growth:
-        plot(growth, args.plots)
+        curves = {LABELS[name]: {n: 1e3 * v for n, v in x.items()} for name, x in growth.items()}
+        plot_growth(curves, "time of one more frame [ms]", args.plots / "table_2.png")
 
 
 def measure_growth(trials: Trials, sizes: tuple[int, ...]) -> dict[str, dict[int, float]]:
@@ -136,20 +133,6 @@ def measure_growth(trials: Trials, sizes: tuple[int, ...]) -> dict[str, dict[int
             times = measure(trials, {name: method}, size, 2 if name == "ap" and size == 1000 else 5)
             growth[name][size] = float(np.median(times[name]))
     return growth
-
-
-def plot(growth: dict[str, dict[int, float]], out: Path) -> None:
-    """Time of a frame against the number of points."""
-    out.mkdir(parents=True, exist_ok=True)
-    figure, axis = plt.subplots(figsize=(6.5, 4.5), layout="constrained")
-    for name, x in growth.items():
-        axis.loglog(list(x), [1e3 * v for v in x.values()], "o-", label=LABELS[name])
-    axis.set(xlabel="points N", ylabel="time of one more frame [ms]")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend()
-    with atomic_path(out / "table_2.png") as path:
-        figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

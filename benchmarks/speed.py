@@ -16,7 +16,6 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,9 +24,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from contract import parser, report, table
+from contract import in_turns, parser, plot_growth, report, table
 from gradient_cost import sequence
 from paper_filters import draw, start_of
 from tqdm import tqdm
@@ -36,7 +34,6 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxtri import ekf  # noqa: E402
 from jaxtri.geometry.pose import rotation_matrix  # noqa: E402
-from jaxtri.io import atomic_path  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, TrifocalState, start  # noqa: E402
 
 SIZES = (30, 100, 300, 1000, 3000, 10000)
@@ -142,19 +139,6 @@ def build(folder: Path) -> ctypes.CDLL | None:
     return ctypes.CDLL(str(library))
 
 
-def timed(runs: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
-    """Seconds a frame of each in each round, in turns."""
-    for run in runs.values():
-        jax.block_until_ready(run())
-    seconds = {name: np.empty(rounds) for name in runs}
-    for k in range(rounds):
-        for name, run in runs.items():
-            began = time.perf_counter()
-            jax.block_until_ready(run())
-            seconds[name][k] = (time.perf_counter() - began) / FRAMES
-    return seconds
-
-
 def difference(a: Answer, b: Answer) -> float:
     """Largest difference of the poses."""
     return float(max(np.abs(x - y).max() for x, y in zip(a[:2], b[:2], strict=True)))
@@ -169,7 +153,7 @@ def beside(seed: int, points: int, rounds: int) -> dict[str, float]:
         f = start_of(e, view, method)
         run = jax.jit(lambda carry, z, step=f.step: jax.lax.scan(lambda c, z: (step(c, z)[0], None), carry, z)[0])
         runs[method] = partial(run, f.carry, f.observed[-FRAMES:])
-    seconds = timed(runs, rounds)
+    seconds = in_turns(runs, rounds)
     return {
         f"pose_and_bank_over_pose_n{points}": float(np.median(seconds["default"] / seconds["pose"])),
         f"bases8_over_default_n{points}": float(np.median(seconds["bases8"] / seconds["pose"])),
@@ -186,26 +170,26 @@ def main() -> None:
         library = build(Path(folder))
         for n in tqdm(sizes, leave=False, disable=None):
             problem = Problem(args.seed, n)
-            runs: dict[str, Callable[[], object]] = {}
+            runs: dict[str, Callable[[], Any]] = {}
             if library is not None:
                 runs["C++"] = problem.reference(library)
             runs |= {"scan": problem.scan(1, False), "step": problem.step(), "default": problem.scan(4, True)}
-            seconds = timed(runs, max(3, rounds // 5) if n > 1000 else rounds)
-            ours = answer(problem.scan(1, False)())
+            seconds = in_turns(runs, max(3, rounds // 5) if n > 1000 else rounds)
+            ours = answer(runs["scan"]())
             P = ours.covariance
             assert np.linalg.eigvalsh(P).min() > -1e-9 * P.max()
             if n <= 1000:
                 off = [difference(ours, answer(problem.scan(1, False, plain=True)()))]
-                off += [] if library is None else [difference(ours, problem.reference(library)())]
+                off += [difference(ours, runs["C++"]())] if library is not None else []
                 worst = max(worst, *off)
             for name, x in seconds.items():
-                micro[name][n] = 1e6 * float(np.median(x))
+                micro[name][n] = 1e6 * float(np.median(x)) / FRAMES
             if library is not None:
                 for name in ("scan", "step"):
                     figures[f"{name}_over_cpp_n{n}"] = float(np.median(seconds[name] / seconds["C++"]))
             if n == 300:
                 figures["default_over_single_pass_n300"] = float(np.median(seconds["default"] / seconds["scan"]))
-                figures["scan_frames_per_s_n300"] = float(1 / np.median(seconds["scan"]))
+                figures["scan_frames_per_s_n300"] = float(FRAMES / np.median(seconds["scan"]))
             over = [f"{figures.get(f'{name}_over_cpp_n{n}', float('nan')):.1f}" for name in ("scan", "step")]
             rows.append([n, *(f"{micro[name].get(n, float('nan')):.1f}" for name in micro), *over])
     figures["answer_difference"] = worst
@@ -216,23 +200,8 @@ def main() -> None:
         figures |= beside(args.seed, 300, rounds)
     print("\n" + table(["", ""], [[k, f"{v:.3g}"] for k, v in figures.items() if "over_cpp" not in k]))
     if args.plots is not None:
-        plot(micro, args.plots)
+        plot_growth({k: v for k, v in micro.items() if v}, "a frame [us]", args.plots / "speed.png")
     report(args.json, figures)
-
-
-def plot(micro: dict[str, dict[int, float]], out: Path) -> None:
-    """Cost of a frame against the number of points."""
-    out.mkdir(parents=True, exist_ok=True)
-    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
-    for name, x in micro.items():
-        if x:
-            axis.loglog(list(x), list(x.values()), "o-", label=name)
-    axis.set(xlabel="points N", ylabel="a frame [us]")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend()
-    with atomic_path(out / "speed.png") as path:
-        figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

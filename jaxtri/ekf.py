@@ -236,7 +236,7 @@ def _measuring(
     items = prepare(model, items, mask)
     if isinstance(items, Moments):
         assert isinstance(model, Projective)
-        support = np.arange(d) if model.support is None else model.support
+        support = model.support
 
         def at(prior: Mean, delta: Array, observed: Array, mask: Array, scale: Array | None) -> Evidence:
             return moments.linearise(model, prior, delta, items, observed, mask, scale, support)
@@ -357,6 +357,11 @@ def _nearby(model: Dynamics[Mean], mean: Mean, other: Mean) -> Float[Array, " d"
     return getattr(model, "difference", model.local)(mean, other)
 
 
+def change_of_origin(model: Dynamics[Mean], mean: Mean, delta: Float[Array, " d"], moved: Mean) -> Float[Array, "d d"]:
+    """Derivative of the error at `moved`, which is `retract(mean, delta)`, with respect to that at `mean`."""
+    return jax.jacfwd(lambda e: _nearby(model, moved, model.retract(mean, delta + e)))(jnp.zeros_like(delta))
+
+
 def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float[Array, "d d"]:
     """Derivative of the error after one time step with respect to the error before it."""
     after = model.predict(mean, dt)
@@ -461,8 +466,8 @@ def update(
         covariance = jnp.where(jnp.logical_and.outer(considered, considered), P, covariance)
 
     moved = model.retract(mean, final)
-    # The error now lives at the new mean: carry the covariance there by the derivative of the change of origin.
-    reset = jax.jacfwd(lambda e: _nearby(model, moved, model.retract(mean, final + e)))(jnp.zeros_like(final))
+    # The error now lives at the new mean: carry the covariance there.
+    reset = change_of_origin(model, mean, final, moved)
     posterior = Belief(moved, reset @ covariance @ reset.T)
 
     log_det = log_det + noise_log_det
@@ -546,7 +551,7 @@ def smooth(model: Dynamics[Mean], beliefs: Belief[Mean], dt: Float[Array, " t"] 
         mean = model.retract(now.mean, delta)
         left = jnp.eye(len(P), dtype=P.dtype) - G @ F
         covariance = left @ P @ left.T + G @ Q @ G.T + onto @ later.covariance @ onto.T
-        reset = jax.jacfwd(lambda x: model.local(mean, model.retract(now.mean, delta + x)))(zero)
+        reset = change_of_origin(model, now.mean, delta, mean)
         smoothed = Belief(mean, reset @ covariance @ reset.T)
         return smoothed, smoothed
 

@@ -24,8 +24,8 @@ class Projective(Protocol[Mean]):
     sigma: Float[Array, ""]  # of a component of a measurement
 
     @property
-    def support(self) -> np.ndarray | None:
-        """Components of the error that the map depends on; None for all."""
+    def support(self) -> np.ndarray:
+        """Components of the error that the map depends on."""
         ...
 
     def retract(self, mean: Mean, delta: Float[Array, " d"]) -> Mean:

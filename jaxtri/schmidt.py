@@ -177,7 +177,7 @@ def update(
     def prior_at(mean: Mean) -> tuple[Array, Array]:
         """The change to the errors of another mean, and the prior's centre in these."""
         delta = model.local(belief.mean, mean)
-        reset = jax.jacfwd(lambda e: model.local(mean, model.retract(belief.mean, delta + e)))(jnp.zeros_like(delta))
+        reset = ekf.change_of_origin(model, belief.mean, delta, mean)
         return reset, -reset @ delta
 
     def iterate(k: Array, carry: tuple[Mean, Array]) -> tuple[Mean, Array]:
@@ -218,7 +218,7 @@ def update(
 
     # The error now lives at the new mean, close by.
     final = model.retract(mean, e)
-    shift = jax.jacfwd(lambda x: model.local(final, model.retract(mean, e + x)))(jnp.zeros_like(e))
+    shift = ekf.change_of_origin(model, mean, e, final)
     gain = _times(shift, gain)
     keep = (shift - _rows(gain) @ lin.at.jacobian.reshape(-1, d)) @ reset
     sensitivity = _times(keep, belief.sensitivity)

@@ -170,7 +170,7 @@ def log_pose(pose: SE3) -> Float[Array, "6"]:
 def adjoint(pose: SE3) -> Float[Array, "6 6"]:
     """The matrix that carries a twist through a pose: pose exp(xi) = exp(adjoint xi) pose."""
     R, T = matrix(pose.rotation()), pose.translation()
-    return jnp.block([[R, jnp.cross(T, R.T).T], [jnp.zeros_like(R), R]])
+    return jnp.block([[R, cross_matrix(T) @ R], [jnp.zeros_like(R), R]])
 
 
 def multiply(a: SE3, b: SE3) -> SE3:
@@ -269,4 +269,4 @@ def shear(T: Float[Array, "3"]) -> Float[Array, "6 6"]:
     exp(xi) of a pose also turns its T: rho = delta_T + T x delta_R. Its inverse is `shear(-T)`.
     """
     eye, zero = jnp.eye(3, dtype=T.dtype), jnp.zeros((3, 3), T.dtype)
-    return jnp.block([[eye, jnp.cross(T, eye).T], [zero, eye]])
+    return jnp.block([[eye, cross_matrix(T)], [zero, eye]])
