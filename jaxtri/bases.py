@@ -12,6 +12,7 @@ from jaxlie import SE3
 from jaxtyping import Array
 
 from jaxtri import segments, tracker
+from jaxtri.compilation import capacity
 from jaxtri.geometry.pose import compose, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.tracker import Report, Settings, Status
@@ -161,8 +162,8 @@ def hold(
     settings: Settings, state: tracker.State, frame: Frame, visible: np.ndarray, dt: float
 ) -> tuple[tracker.State, Report]:
     """One frame measured with the tracks as they are: none begins, no keyframe is made."""
-    arrays = jnp.asarray(frame.u), jnp.asarray(visible), jnp.zeros(len(visible), bool)
-    return _step(settings, state, *arrays, dt, hold=jnp.asarray(True), quality=jnp.asarray(frame.quality))
+    nothing = np.zeros(len(visible), bool)
+    return _step(settings, state, frame.u, visible, nothing, dt, hold=np.True_, quality=frame.quality)
 
 
 @jax.jit
@@ -186,12 +187,17 @@ class Points(NamedTuple):
     covariance: np.ndarray
 
 
+def no_points() -> Points:
+    """None at all."""
+    return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+
 class _Structure:
     """The points of a bank as tracks come and go: what each was last known to be."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._ended: list[Points] = []
+        self._ended: list[tuple[Bank, np.ndarray]] = []
 
     def of(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> Points:
         """The known points of the `good` slots."""
@@ -202,12 +208,19 @@ class _Structure:
     def end(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> None:
         """Keep the points of the `good` slots, whose tracks have ended."""
         if good.any():
-            self._ended.append(self.of(bank, good, ids))
+            self._ended.append((jax.tree.map(lambda x: np.asarray(x)[good], bank), ids[good]))
 
-    def ended(self) -> list[Points]:
+    def ended(self) -> Points:
         """What was kept since the last call."""
-        ended, self._ended = self._ended, []
-        return ended
+        if not self._ended:
+            return no_points()
+        banks, ids = zip(*self._ended, strict=True)
+        self._ended = []
+        # Filled up to one of a few lengths, each of which compiles once.
+        count = sum(map(len, ids))
+        spare = capacity(count) - count
+        bank = jax.tree.map(lambda *x: np.concatenate([*x, np.repeat(x[0][:1], spare, axis=0)]), *banks)
+        return self.of(bank, np.arange(count + spare) < count, np.concatenate([*ids, np.full(spare, -1)]))
 
 
 class Follower(Protocol):
@@ -225,7 +238,7 @@ class Follower(Protocol):
         """The pose of the next frame."""
         ...
 
-    def ended(self) -> list[Points]:
+    def ended(self) -> Points:
         """The points of tracks that have ended since the last call."""
         ...
 
@@ -257,12 +270,12 @@ class TrackPairs:
         self.state, report = _step(
             self.settings,
             self.state,
-            jnp.asarray(frame.u),
-            jnp.asarray(frame.visible),
-            jnp.asarray(fresh),
+            frame.u,
+            frame.visible,
+            fresh,
             dt,
-            hold=jnp.asarray(False),
-            quality=jnp.asarray(frame.quality),
+            hold=np.False_,
+            quality=frame.quality,
         )
         self.keyframes += int(report.keyframe)
         return report
@@ -271,7 +284,7 @@ class TrackPairs:
         # What no base pair agrees on is not a point of the scene.
         return np.asarray(self.state.tracks.usable) & np.asarray(self.state.born)
 
-    def ended(self) -> list[Points]:
+    def ended(self) -> Points:
         """The points of tracks that have ended since the last call."""
         return self._structure.ended()
 
@@ -340,8 +353,8 @@ class SinglePair:
         fresh = frame.fresh | (frame.ids != self._ids)
         over = np.asarray(self.state.inside) & (fresh | ~frame.visible)
         self._structure.end(self.state.structure, over, self._ids)
-        arrays = jnp.asarray(frame.u), jnp.asarray(frame.visible), jnp.asarray(fresh)
-        self.state, report = _segment_step(self.settings, self.state, *arrays, dt, quality=jnp.asarray(frame.quality))
+        arrays = frame.u, frame.visible, fresh
+        self.state, report = _segment_step(self.settings, self.state, *arrays, dt, quality=frame.quality)
         self._history.append((frame, report.pose, report.covariance))
         return report
 
@@ -397,7 +410,7 @@ class SinglePair:
         self.begun.append(Restart(frame.index, now.index, now.index, refined, frame.common(now)))
         self.keyframes += 1
 
-    def ended(self) -> list[Points]:
+    def ended(self) -> Points:
         """The points of tracks that have ended since the last call."""
         return self._structure.ended()
 

@@ -91,7 +91,10 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(Command, args=arguments, prog="jaxtri", description=__doc__)  # pyright: ignore
     import jax
 
+    from jaxtri.compilation import keep_programs
+
     jax.config.update("jax_enable_x64", True)
+    keep_programs()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", TruncatedVideoWarning)

@@ -373,28 +373,6 @@ def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float
     return jax.jacfwd(error)(jnp.zeros(noise.shape[0], noise.dtype))
 
 
-def information(
-    model: Model[Mean],
-    mean: Mean,
-    items: PyTree[Array],
-    weights: Float[Array, " n"],
-    noise_scale: Float[Array, " n"] | None = None,
-) -> tuple[Float[Array, "d d"], Float[Array, "n d m"]]:
-    """What the items say of the error at `mean`: A = sum w H' D^-1 H, and w H' D^-1 of each.
-
-    `P @ (w H' D^-1)` is an item's share of the gain of an update whose posterior covariance is P. Items of
-    weight zero count nothing. `noise_scale` as of `update`.
-    """
-    mask = weights > 0
-    items, noise_scale = stand_in(mask, items), replace_masked(mask, noise_scale, 1.0)
-    observed = jax.vmap(lambda item: model.measure(mean, item))(items)
-    d = model.process_noise(mean, jnp.ones((), weights.dtype)).shape[0]
-    lin = _linearise(model, mean, jnp.zeros(d, weights.dtype), items, observed, mask, noise_scale)
-    A, _ = lin.normal_equations(weights)
-    whitened = jnp.einsum("nij,njd->nid", lin.whitener, lin.jacobian)
-    return A, jnp.einsum("n,nid,nij->ndj", weights, whitened, lin.whitener)
-
-
 def predict(model: Model[Mean], belief: Belief[Mean], dt: Float[Array, ""] | float = 1.0) -> Belief[Mean]:
     """The belief one time step later."""
     P = belief.covariance

@@ -58,27 +58,17 @@ def carry(
     sensitivity: Float[Array, "d s"],
     transition: Float[Array, "d d"],
     covariance: Float[Array, "d d"],
-    information: Float[Array, "d d"],
-    gains: Float[Array, "n d m"],
-    levers: Float[Array, "n m 12"],
-    first: Int[Array, " n"],
-    second: Int[Array, " n"],
+    information: Float[Array, "6 6"],
+    coupling: Float[Array, "6 s"],
 ) -> Float[Array, "d s"]:
-    """The sensitivity after a prediction and an update.
+    """The sensitivity after a prediction and an update: B <- (I - P A) F B - P C.
 
-    `covariance` is the posterior P, `information` A and `gains` are those of `ekf.information`, `levers` the
-    derivatives of the measurements with respect to the errors of the two base frames in the slots `first`
-    and `second` (-1: one no longer kept): B <- (I - P A) F B - P sum w H' D^-1 J.
+    P is the posterior `covariance`; `information` A = sum w H' D^-1 H and `coupling` C = sum w H' D^-1 J are what
+    the update's measurements say of the pose, the first six components of the error, and of the pose together with
+    the keyframes (`jaxtri.moments`).
     """
-    d, k = sensitivity.shape[0], sensitivity.shape[1] // 6
     moved = transition @ sensitivity
-    blocks = gains @ levers
-    pull = jnp.zeros((k, d, 6), sensitivity.dtype)
-    for slots, part in ((first, blocks[..., :6]), (second, blocks[..., 6:])):
-        kept = jnp.where((slots >= 0)[:, None, None], part, 0.0)
-        pull = pull.at[jnp.maximum(slots, 0)].add(kept)
-    flat = jnp.moveaxis(pull, 0, 1).reshape(d, 6 * k)
-    return moved - covariance @ (information @ moved + flat)
+    return moved - covariance[:, :6] @ (information @ moved[:6] + coupling)
 
 
 def total(own: Float[Array, "6 6"], keyframes: Keyframes, sensitivity: Float[Array, "d s"]) -> Float[Array, "6 6"]:

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Mean = TypeVar("Mean")
 
@@ -69,6 +69,7 @@ class Evidence(eqx.Module):
     """What a frame's measurements say at one state: `jaxtri.ekf.Evidence`."""
 
     items: Moments
+    map: Float[Array, "3 q"]
     slope: Float[Array, "3 q s"]  # derivative of the map with respect to the error, the s components that it depends on
     image: Float[Array, "2 n"]
     depth: Float[Array, " n"]  # third component before the division
@@ -93,21 +94,46 @@ class Evidence(eqx.Module):
     def normal_equations(self, weights: Float[Array, " n"]) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
         """A = sum w H' W H and sum w H' W r."""
         x, y = self.image
-        over = weights / self.depth
-        xx, xy, yy = self.weight * over
-        r, s = self.residual
+        weighted, (r, s) = self._weighted(weights), self.residual
+        xx, xy, yy = weighted
         # B = [I, -image] / depth takes a change of M c to one of the image: B' W r, and below B' W B.
         a, b = xx * r + xy * s, xy * r + yy * s
         pull = jnp.stack([a, b, -(x * a + y * b)]) @ self.items.coordinates.T
-        xx, xy, yy = jnp.stack([xx, xy, yy]) / self.depth
-        xz, yz = xx * x + xy * y, xy * x + yy * y
-        sums = jnp.stack([xx, xy, -xz, yy, -yz, x * xz + y * yz]) @ self.items.products
+        sums = self._information(weighted) @ self.items.products
         q = self.slope.shape[1]
         block, entry = _symmetric(3), _symmetric(q)
         flat = block[:, None, :, None] * sums.shape[1] + entry[None, :, None, :]
         K = sums.ravel()[flat.reshape(3 * q, 3 * q)]
         D = self.slope.reshape(3 * q, -1)
         return D.T @ (K @ D), pull.ravel() @ D
+
+    def coupling(
+        self, weights: Float[Array, " n"], levers: Float[Array, "n q e"], groups: Int[Array, " n"], k: int
+    ) -> Float[Array, "s ke"]:
+        """Sum w H' W L of the items of each of k groups, L the derivative of the image by e errors of the group.
+
+        `levers` are the derivatives of the coordinates; an item whose group is negative counts nothing.
+        """
+        n, q, e = levers.shape
+        # V = B' W B M lever of each item; H' W L is the slope times c V'.
+        six = self._information(self._weighted(weights))
+        moved = jnp.moveaxis(levers, 0, -1).reshape(q, e * n)
+        moved = (self.map @ moved).reshape(3, e, n)
+        V = jnp.einsum("abn,ben->aen", six[_symmetric(3)], moved)
+        each = (self.items.coordinates[:, None, None] * V).reshape(q * 3 * e, n)
+        member = groups[:, None] == jnp.arange(k)
+        sums = (each @ member.astype(each.dtype)).reshape(q, 3, e, k)
+        return jnp.einsum("aqs,qaek->ske", self.slope, sums).reshape(-1, k * e)
+
+    def _weighted(self, weights: Float[Array, " n"]) -> Float[Array, "3 n"]:
+        return self.weight * (weights / self.depth)
+
+    def _information(self, weighted: Float[Array, "3 n"]) -> Float[Array, "6 n"]:
+        """B' W B of each item, with its weight: the upper triangle of a symmetric matrix."""
+        x, y = self.image
+        xx, xy, yy = weighted / self.depth
+        xz, yz = xx * x + xy * y, xy * x + yy * y
+        return jnp.stack([xx, xy, -xz, yy, -yz, x * xz + y * yz])
 
 
 def _symmetric(n: int) -> np.ndarray:
@@ -153,4 +179,4 @@ def linearise(
     det = xx * schur
     weight = jnp.where(mask, jnp.stack([yy, -xy, xx]) / (det * variance), 0.0)
     log_det = jnp.where(mask, jnp.log(det) + 2 * jnp.log(variance), 0.0)
-    return Evidence(items, slope, image, depth, jnp.where(mask, observed.T - image, 0.0), weight, log_det)
+    return Evidence(items, M, slope, image, depth, jnp.where(mask, observed.T - image, 0.0), weight, log_det)

@@ -24,6 +24,7 @@ from jaxtri.bases import (
     fill,
     find,
     hold,
+    no_points,
 )
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.geometry.camera import Camera
@@ -59,7 +60,8 @@ class FramePose:
         return replace(self, T_camera_world=T, covariance=self.covariance * np.outer(s, s))
 
 
-_normalise = eqx.filter_jit(lambda camera, pixels: camera.to_normalised(pixels))
+_normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
+_matrix = jax.jit(SE3.as_matrix)
 
 
 @dataclass
@@ -122,7 +124,6 @@ class Odometry:
             return np.zeros(len(frame.visible), bool)
         report = self._follower.follow(frame, self._dt(index))
         self._record(frame, report.pose, report)
-        self._collect()
         if self.poses[-1].status is Status.LOST:
             self._lose(frame)
         return np.asarray(report.drop)
@@ -171,11 +172,13 @@ class Odometry:
 
     def points(self) -> Points:
         """The points of all tracks so far, in the world frame, each as it was last known."""
+        if self._follower is not None:
+            _keep(self._points, self._follower.ended())
         known = self._points.copy()
         if self._follower is not None:
             _keep(known, self._follower.present())
         if not known:
-            return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+            return no_points()
         ids = np.array(sorted(known))
         xyz, covariance = (np.stack([known[i][k] for i in ids]) for k in (0, 1))
         return Points(ids, xyz, covariance)
@@ -217,7 +220,7 @@ class Odometry:
 
     def _frame(self, index: int, tracks: FrameTracks, time: float) -> Frame:
         visible = np.asarray(tracks.visible, bool) & np.isfinite(tracks.pixels).all(axis=1)
-        pixels = jnp.asarray(np.where(visible[:, None], tracks.pixels, 0.0), self._settings.sigma.dtype)
+        pixels = np.where(visible[:, None], tracks.pixels, 0.0).astype(self._settings.sigma.dtype)
         u = np.asarray(_normalise(self.camera, pixels))
         visible &= np.isfinite(u).all(axis=1)
         fresh = np.asarray(tracks.fresh, bool) & visible
@@ -231,18 +234,13 @@ class Odometry:
 
     def _record(self, frame: Frame, pose: SE3, report: Report | None, status: Status | None = None) -> None:
         entry = self.poses[frame.index]
-        entry.T_camera_world = np.asarray(pose.as_matrix(), np.float64)
+        entry.T_camera_world = np.asarray(_matrix(pose), np.float64)
         entry.covariance = np.zeros((6, 6)) if report is None else np.asarray(report.covariance, np.float64)
         if report is not None:
             entry.status = Status(int(report.status))
             entry.used, entry.nis = int(report.diagnostics.used), float(report.diagnostics.nis)
         if status is not None:
             entry.status = status
-
-    def _collect(self) -> None:
-        assert self._follower is not None
-        for points in self._follower.ended():
-            _keep(self._points, points)
 
     # -- starting ---------------------------------------------------------------------------------------------
 
@@ -319,7 +317,8 @@ class Odometry:
         self._changes += len(self._follower.begun)
         self._recording = False
         self._depth = self._follower.depth
-        _keep(self._points, self._follower.present())
+        for points in (self._follower.ended(), self._follower.present()):
+            _keep(self._points, points)
         self._follower = None
         self._waiting, self._tried = [frame], (-1, 0.0)
         self.reason = "too few points agreed with any motion"

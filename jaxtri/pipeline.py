@@ -1,10 +1,12 @@
 """From frames to a trajectory: feature tracking, the recursive filter, and what is worth keeping of both."""
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 from tqdm import tqdm
@@ -16,7 +18,7 @@ from jaxtri.odometry import Odometry
 from jaxtri.tracker import Settings, Status
 from jaxtri.trajectory import Trajectory
 from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
-from jaxtri.vision.video import Frame, FrameSource
+from jaxtri.vision.video import Frame, FrameSource, ahead
 
 
 @dataclass
@@ -51,6 +53,8 @@ def track(
 ) -> Run:
     """Recover the camera's trajectory from the frames of a source, one pass, in order.
 
+    Frames are decoded by a thread of their own while others are followed.
+
     With `record` the run can be differentiated: `run.odometry.recording()` and `jaxtri.replay`.
     An interrupt (Ctrl-C) ends the sequence there; what was tracked so far is kept. Raises
     `InitialisationError` where the camera never moved enough, `CameraError` where the frames are not of the
@@ -58,27 +62,28 @@ def track(
     """
     follower, tracker = KLT(klt or KLTSettings()), Odometry(camera, settings, base, start, record=record)
     colours: dict[int, np.ndarray] = {}
-    seconds = {"decoding": 0.0, "optical flow": 0.0, "filter": 0.0}
+    seconds = {"waiting for frames": 0.0, "optical flow": 0.0, "filter": 0.0}
     declared = source.declared if isinstance(source, FrameSource) else None
     bar = tqdm(total=declared, unit="frame", disable=None if progress else True, leave=False)
     interrupted = False
+    milliseconds: list[float] = []
     began = clock = time.perf_counter()
     try:
-        for frame in source:
-            seconds["decoding"] += time.perf_counter() - clock
-            _same_size(camera, frame)
-            clock = time.perf_counter()
-            tracks = follower.track(frame.image)
-            _sample(colours, tracks, frame.image)
-            seconds["optical flow"] += time.perf_counter() - clock
-            clock = time.perf_counter()
-            follower.drop(tracker.add(tracks, frame.time_s))
-            seconds["filter"] += time.perf_counter() - clock
-            bar.set_postfix_str(f"{tracker.status.name.lower()}, {tracker.poses[-1].used} points", refresh=False)
-            bar.update()
-            if max_frames is not None and len(tracker.poses) >= max_frames:
-                break
-            clock = time.perf_counter()
+        with contextlib.closing(ahead(islice(source, max_frames))) as frames:
+            for frame in frames:
+                got = time.perf_counter()
+                _same_size(camera, frame)
+                tracks = follower.track(frame.image)
+                _sample(colours, tracks, frame.image)
+                followed = time.perf_counter()
+                follower.drop(tracker.add(tracks, frame.time_s))
+                filtered = time.perf_counter()
+                for part, took in zip(seconds, (got - clock, followed - got, filtered - followed), strict=True):
+                    seconds[part] += took
+                bar.set_postfix_str(f"{tracker.status.name.lower()}, {tracker.poses[-1].used} points", refresh=False)
+                bar.update()
+                milliseconds.append(1e3 * (time.perf_counter() - clock))
+                clock = time.perf_counter()
     except KeyboardInterrupt:
         interrupted = True
     finally:
@@ -90,6 +95,7 @@ def track(
     statistics = _statistics(tracker) | {
         "frames_per_second": len(tracker.poses) / (time.perf_counter() - began),
         "seconds": {k: round(v, 3) for k, v in seconds.items()},
+        "milliseconds_of_frame": [round(m, 2) for m in milliseconds],
         "interrupted": interrupted,
     }
     rgb = np.array([colours.get(int(i), grey) for i in points.ids], np.uint8).reshape(-1, 3)

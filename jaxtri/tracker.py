@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri import ekf
+from jaxtri import ekf, moments
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 from jaxtri.geometry.pose import multiply, relative
@@ -279,11 +279,13 @@ def step(
     dt = jnp.asarray(dt, observed.dtype)
     belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, mask, state.coasted)
     drop = ok & mask & (diagnostics.distance > settings.outlier)
-    A, gains = ekf.information(model, belief.mean, tracks.base, jnp.where(ok, diagnostics.weights, 0.0), scale)
-    levers = jax.vmap(lambda item, lever: model.lever(belief.mean, item, lever))(tracks.base, tracks.lever)
-    levers = jnp.where(mask[:, None, None], levers, 0.0)
-    F = ekf.transition(model, state.belief.mean, dt)
-    sensitivity = carry(state.sensitivity, F, belief.covariance, A, gains, levers, *tracks.slots.T)
+    weights = jnp.where(ok, diagnostics.weights, 0.0)
+    sensitivity = carry(
+        state.sensitivity,
+        ekf.transition(model, state.belief.mean, dt),
+        belief.covariance,
+        *_owed(model, belief.mean, tracks, weights, scale, state.sensitivity.shape[1] // 6),
+    )
     visible = visible & ~drop
     tracks = _only(tracks, ~drop)
     held = state.held & keep & ~drop
@@ -307,10 +309,24 @@ def step(
     depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
     plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, coasted, structure, born)
-    rebased = _rebase(settings, plain, observed, visible)
-    new = jax.tree.map(lambda a, b: jnp.where(keyframe, a, b), rebased, plain)
+    new = jax.lax.cond(keyframe, lambda: _rebase(settings, plain, observed, visible), lambda: plain)
     covariance = total(belief.covariance[:6, :6], state.keyframes, sensitivity)
     return new, Report(belief.mean.pose, covariance, status, keyframe, drop, diagnostics)
+
+
+def _owed(
+    model: BasePairs, mean: Twist, tracks: Tracks, weights: Float[Array, " n"], scale: Float[Array, " n"] | None, k: int
+) -> tuple[Float[Array, "6 6"], Float[Array, "6 s"]]:
+    """What the measurements of an update say of the pose, and of the pose together with k keyframes."""
+    mask = weights > 0
+    items = moments.prepare(model, ekf.stand_in(mask, tracks.base))
+    scale = ekf.replace_masked(mask, scale, 1.0)
+    zero, unmeasured = jnp.zeros(12, weights.dtype), jnp.zeros_like(tracks.first)
+    said = moments.linearise(model, mean, zero, items, unmeasured, mask, scale, model.support)
+    levers = jnp.where(mask[:, None, None], tracks.lever, 0.0)
+    A, _ = said.normal_equations(weights)
+    first, second = (said.coupling(weights, levers[..., 6 * j : 6 * j + 6], tracks.slots[:, j], k) for j in (0, 1))
+    return A, first + second
 
 
 def _only(tracks: Tracks, keep: Bool[Array, " n"]) -> Tracks:

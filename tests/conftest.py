@@ -5,6 +5,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # One thread an operation: with two test workers on two cores, more only makes them wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "agg")
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # the command line's, in the home of whoever runs the tests
 
 # The suite spends its time compiling, not computing.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")

@@ -119,3 +119,24 @@ def test_items_are_prepared_once(experiment):
     observed = experiment[0].observed[2]
     for a, b in zip(*(jax.tree.leaves(step(model, belief, x, observed, mask)) for x in (pairs, prepared)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_what_items_say_of_the_state_and_what_their_points_owe(experiment):
+    """Summed over groups, against each item's own Jacobians; an item of no group counts nothing."""
+    model, belief, items = base_pairs(*experiment, jnp.zeros(()))
+    keys, mean = jax.random.split(jax.random.key(5), 3), belief.mean
+    levers = jax.random.normal(keys[0], (POINTS, 4, 6))
+    weights = jax.random.uniform(keys[1], POINTS).at[3].set(0.0)
+    groups = jax.random.randint(keys[2], POINTS, -1, 4)
+    prepared, none = moments.prepare(model, items), jnp.zeros((POINTS, 2))
+    said = moments.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None, model.support)
+
+    def one(item, lever):
+        H = jax.jacfwd(lambda e: model.measure(model.retract(mean, e), item))(jnp.zeros(12))
+        J = jax.jacfwd(lambda X: model.measure(mean, item._replace(point=X)))(item.point) @ lever
+        return H.T @ jnp.linalg.solve(model.noise(mean, item), J)
+
+    each = weights[:, None, None] * jax.vmap(one)(items, levers)
+    expected = jnp.concatenate([each[groups == k].sum(axis=0)[:6] for k in range(4)], axis=1)
+    found = said.coupling(weights, levers, groups, 4)
+    np.testing.assert_allclose(found, expected, atol=1e-9 * float(jnp.abs(expected).max()))

@@ -1,9 +1,12 @@
+import contextlib
+import threading
+
 import cv2
 import numpy as np
 import pytest
 
 from jaxtri.errors import ResolutionChangeError, TruncatedVideoError, TruncatedVideoWarning, VideoError
-from jaxtri.vision.video import Frame, open_source, spool, write_video
+from jaxtri.vision.video import Frame, ahead, open_source, spool, write_video
 
 
 def images(count, size=(64, 48)):
@@ -162,3 +165,28 @@ def test_spooled_frames_come_back_with_their_times(tmp_path):
         again = list(source)
     np.testing.assert_allclose([f.time_s for f in again], [0.05, 0.15, 0.25])
     assert again[0].image.shape == (48, 64, 3)
+
+
+def readers():
+    return [thread for thread in threading.enumerate() if thread.name == "reads ahead"]
+
+
+def test_frames_read_ahead_are_the_same_and_so_are_the_errors(folder, tmp_path):
+    with open_source(folder(6)) as source:
+        assert grays(ahead(source, depth=2)) == list(range(6))
+
+    def broken():
+        yield from (Frame(k, 0.1 * k, image) for k, image in enumerate(images(2)))
+        raise VideoError("unplugged")
+
+    with pytest.raises(VideoError, match="unplugged"):
+        list(ahead(broken(), depth=1))
+    assert not readers()
+
+
+def test_whoever_leaves_early_leaves_no_thread_behind(folder):
+    with open_source(folder(12)) as source:
+        with contextlib.closing(ahead(source, depth=2)) as frames:
+            assert next(frames).index == 0
+        assert 1 <= source.decoded <= 5  # no more was read than was room for
+    assert not readers()

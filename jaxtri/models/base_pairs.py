@@ -101,10 +101,6 @@ class BasePairs(eqx.Module):
         """Its derivative with respect to the two base observations."""
         return item.spread
 
-    def lever(self, mean: Twist, item: BasePoint, lever: Float[Array, "4 12"]) -> Float[Array, "2 12"]:
-        """Derivative of the transferred point with respect to the errors of its base poses."""
-        return jax.jacfwd(lambda X: self._project(mean, X))(item.point) @ lever
-
     def noise(self, mean: Twist, item: BasePoint) -> Float[Array, "2 2"]:
         """sigma^2 (I + J J'), J the derivative of the transfer with respect to the two base observations."""
         J = jax.jacfwd(lambda X: self._project(mean, X))(item.point) @ item.spread

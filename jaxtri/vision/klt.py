@@ -1,5 +1,6 @@
 """Feature tracks from images: Shi-Tomasi corners followed by pyramidal Lucas-Kanade, through OpenCV."""
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -58,7 +59,9 @@ class KLT:
         self._ids = np.full(n, -1, np.int64)
         self._anchor = np.full(n, -1, np.int64)
         self._anchor_pixels = np.zeros((n, 2), np.float32)
-        self._anchors: dict[int, np.ndarray] = {}
+        self._reach = self.settings.window // 2 + max(4, math.ceil(2 * self.settings.anchor_move))
+        side = 2 * self._reach + 1
+        self._patches = np.zeros((n, side, side), np.uint8)  # of the anchors, about the rounded pixel
         self._previous: np.ndarray | None = None
         self._frame = -1
         self._next_id = 0
@@ -90,8 +93,6 @@ class KLT:
         if self._alive.sum() < self.settings.refill * self.settings.capacity:
             fresh = self._fill(gray)
         self._previous = gray
-        used = set(self._anchor[self._alive].tolist())
-        self._anchors = {k: v for k, v in self._anchors.items() if k in used}
         pixels, alive, ids = self._pixels.astype(np.float64), self._alive.copy(), self._ids.copy()
         return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue)
 
@@ -117,22 +118,34 @@ class KLT:
         return there, np.asarray(good & np.isfinite(there).all(axis=1)), distance, eigenvalue.ravel()
 
     def _realign(self, gray: np.ndarray, error: np.ndarray, eigenvalue: np.ndarray) -> None:
-        for frame in np.unique(self._anchor[self._alive]):
-            slots = np.flatnonzero(self._alive & (self._anchor == frame))
-            if frame == self._frame - 1:
-                continue
-            guess = self._pixels[slots]
-            moved, ok, fb, smaller = self._flow(self._anchors[int(frame)], gray, self._anchor_pixels[slots], guess, 0)
-            ok &= np.linalg.norm(moved - guess, axis=1) < self.settings.anchor_move
-            self._pixels[slots[ok]] = moved[ok]
-            error[slots[ok]], eigenvalue[slots[ok]] = fb[ok], smaller[ok]
-            self._set_anchor(slots[~ok], gray)
+        slots = np.flatnonzero(self._alive & (self._anchor < self._frame - 1))
+        if not slots.size:
+            return
+        # All patches side by side in one image, whatever the frame they come from: one call follows them all.
+        patches, centre = _mosaic(self._patches[slots])
+        now, _ = _mosaic(self._cut(gray, self._pixels[slots]))
+        origin = self._anchor_pixels[slots]
+        place, guess = centre + origin - np.rint(origin), self._pixels[slots]
+        offset = np.rint(guess) - centre
+        moved, ok, fb, smaller = self._flow(patches, now, place, guess - offset, 0)
+        moved = moved + offset
+        ok &= np.linalg.norm(moved - guess, axis=1) < self.settings.anchor_move
+        self._pixels[slots[ok]] = moved[ok]
+        error[slots[ok]], eigenvalue[slots[ok]] = fb[ok], smaller[ok]
+        self._set_anchor(slots[~ok], gray)
 
     def _set_anchor(self, slots: np.ndarray, gray: np.ndarray) -> None:
         if slots.size:
             self._anchor[slots] = self._frame
             self._anchor_pixels[slots] = self._pixels[slots]
-            self._anchors[self._frame] = gray
+            self._patches[slots] = self._cut(gray, self._pixels[slots])
+
+    def _cut(self, gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """Patches about the rounded pixels (n, 2): (n, side, side)."""
+        r = self._reach
+        padded = cv2.copyMakeBorder(gray, r, r, r, r, cv2.BORDER_REFLECT_101)
+        x, y = np.rint(pixels).astype(int).T
+        return np.lib.stride_tricks.sliding_window_view(padded, (2 * r + 1, 2 * r + 1))[y, x]
 
     def _inside(self, pixels: np.ndarray) -> np.ndarray:
         assert self._shape is not None
@@ -191,3 +204,16 @@ class KLT:
         for c in np.unique(cells):  # corners come in order of strength
             rank[cells == c] = held[c] + np.arange((cells == c).sum())
         return np.argsort(rank, kind="stable")
+
+
+def _mosaic(patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patches (n, side, side) side by side in one image, and the pixel (n, 2) of the centre of each."""
+    n, side = patches.shape[:2]
+    columns = math.ceil(math.sqrt(n))
+    rows = math.ceil(n / columns)
+    tiles = np.zeros((rows * columns, side, side), np.uint8)
+    tiles[:n] = patches
+    row, column = np.divmod(np.arange(n), columns)
+    centre = np.stack([column, row], axis=1).astype(np.float32) * side + side // 2
+    image = tiles.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, columns * side)
+    return image, centre

@@ -1,11 +1,14 @@
 """Frames from a video file, a folder of images or a camera, with every way they can go wrong noticed."""
 
+import contextlib
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, Queue
+from threading import Event, Thread
 from typing import Protocol
 
 import cv2
@@ -152,6 +155,40 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise VideoError(f"{text} is a single image; give the folder of the frames")
     return FrameSource(text, Capture(text, text), fps, strict)
+
+
+def ahead(frames: Iterable[Frame], depth: int = 4) -> Generator[Frame, None, None]:
+    """The same frames, read by a thread of their own, up to `depth` of them before they are asked for.
+
+    What the source raises is raised where its frame would have come. Close it (`contextlib.closing`) when leaving
+    early: the thread has let go of the source then.
+    """
+    ready: Queue[Frame | BaseException | None] = Queue(depth)
+    left = Event()
+
+    def read() -> None:
+        last: BaseException | None = None
+        try:
+            for frame in frames:
+                ready.put(frame)
+                if left.is_set():
+                    return
+        except BaseException as error:
+            last = error
+        ready.put(last)
+
+    reader = Thread(target=read, name="reads ahead", daemon=True)
+    reader.start()
+    try:
+        while (item := ready.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        left.set()
+        while reader.is_alive():
+            with contextlib.suppress(Empty):  # make room for one who waits to put
+                ready.get(timeout=0.01)
 
 
 def spool(frames: Iterable[Frame], folder: Path) -> Iterator[Frame]:

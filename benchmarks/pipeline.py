@@ -1,0 +1,84 @@
+"""How many frames a second does the whole pipeline follow, and how long does its slowest frame take?
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/pipeline.py --data ../shared/data
+
+Decoding, optical flow forward and backward, filter and structure, end to end, writing nothing; 300 features, everything
+compiled before. `demo` is the command line's, at 640 x 480; in `restart` the camera is blind for 25 frames of it, so
+that it is lost and starts anew. `p99` and `max` are of the time between two poses, `filter` its share of all.
+
+Last answer: not yet measured.
+"""
+
+import tempfile
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from contract import parser, report, table
+
+jax.config.update("jax_enable_x64", True)
+
+from jaxtri.geometry.camera import Camera  # noqa: E402
+from jaxtri.io import read_camera  # noqa: E402
+from jaxtri.pipeline import Run, track  # noqa: E402
+from jaxtri.synthetic import laboratory  # noqa: E402
+from jaxtri.vision.klt import KLTSettings  # noqa: E402
+from jaxtri.vision.rendered import write_footage  # noqa: E402
+from jaxtri.vision.video import Frame, open_source  # noqa: E402
+
+BLIND = range(50, 75)
+
+
+def blinded(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """With grey images where the camera sees nothing."""
+    for frame in frames:
+        yield replace(frame, image=np.full_like(frame.image, 128)) if frame.index in BLIND else frame
+
+
+def run(folder: Path, camera: Camera, features: int, blind: bool) -> Run:
+    """Once through a sequence."""
+    with open_source(folder) as source, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        frames = blinded(source) if blind else source
+        return track(frames, camera, klt=KLTSettings(capacity=features), progress=False)
+
+
+def main() -> None:
+    options = parser("How many frames a second does the whole pipeline follow?", data=True)
+    options.add_argument("--features", type=int, default=300, help="features followed at once")
+    args = options.parse_args()
+    figures: dict[str, float] = {}
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        demo = Path(temporary)
+        camera = write_footage(demo, laboratory(100, args.seed), args.seed, progress=False)
+        cases = [("demo", demo, camera, False), ("restart", demo, camera, True)]
+        folders = sorted(p.parent for p in args.data.glob("*/frames"))
+        cases += [] if args.quick else [(p.name, p, read_camera(p / "camera.json"), False) for p in folders]
+        for name, folder, camera, blind in cases:
+            run(folder, camera, args.features, blind)  # compiles
+            found: list[Any] = [run(folder, camera, args.features, blind) for _ in range(1 if args.quick else 3)]
+            fps = [r.statistics["frames_per_second"] for r in found]
+            middle = found[int(np.argsort(fps)[len(fps) // 2])]
+            took, seconds = np.array(middle.statistics["milliseconds_of_frame"]), middle.statistics["seconds"]
+            figures |= {
+                f"{name}.fps": float(np.median(fps)),
+                f"{name}.p99_ms": float(np.percentile(took, 99)),
+                f"{name}.max_ms": float(took.max()),
+                f"{name}.filter_share": seconds["filter"] / sum(seconds.values()),
+            }
+            h, w = camera.height, camera.width
+            parts = [f"{1e3 * seconds[k] / len(took):.1f}" for k in seconds]
+            said = [f"{figures[f'{name}.{k}']:.{d}f}" for k, d in (("fps", 0), ("p99_ms", 1), ("max_ms", 1))]
+            rows.append([name, f"{w}x{h}", len(took), *said, f"{figures[f'{name}.filter_share']:.0%}", *parts])
+    head = ["sequence", "size", "frames", "fps", "p99 ms", "max ms", "filter", "waiting ms", "flow ms", "filter ms"]
+    print(table(head, rows))
+    report(args.json, figures)
+
+
+if __name__ == "__main__":
+    main()
