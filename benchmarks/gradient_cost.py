@@ -6,14 +6,14 @@ The paper's experiment, 99 frames of 300 points; the gradient with respect to si
 and `forward` are modes of differentiation; `block` is the frames between two kept beliefs (`jaxtri.scan`). Times are
 medians over interleaved runs, memory is what the compiler sets aside beside arguments and results.
 
-Last answer (2 idle cores, JAX 0.10), 99 frames and `block` 1:
+Last answer (2 idle cores, JAX 0.10), over the run, MB and compilation of the gradient:
 
-mode        run     reverse over run  reverse MB  reverse compiled in
-default      25 ms        5.2             2.2           18 s
-consistent  286 ms        4.6              25           49 s
+mode        frames  run     reverse           block 10         forward
+default     99      41 ms   5.1  2.2  23 s    5.3  2.0  30 s   4.9  1.0  12 s
+default     990     512 ms  5.2  8.6  20 s    5.0  6.3  35 s
+consistent  99      522 ms  4.6  25   48 s    5.0  12   73 s   5.7  6.1  35 s
 
-5 times and 20 s are asked. The row of `consistent` is older than the moment form of `default`, which had 106 ms, 6.1
-times (forward mode 5.8) and 2.5 MB before it; of 990 frames then 6.3 times and 8.9 MB, with `block` 10 5.6 and 6.6 MB.
+5 times and 20 s are asked. On a machine where the first run takes 25 ms it was 5.2 times, compiled in 18 s.
 """
 
 import time
