@@ -366,20 +366,6 @@ def test_prediction_equals_the_dense_one():
     np.testing.assert_allclose(jax.jit(ekf.transition)(model, belief.mean, dt), F, atol=1e-8)
 
 
-def test_information_and_gains_equal_the_sums_over_items():
-    model, belief = sextant()
-    landmarks, _, mask, _ = sextant_frames()
-    weights = jnp.where(mask[0], jnp.linspace(0.2, 1.0, N), 0.0)
-    junk = jnp.where(mask[0][:, None], landmarks, jnp.nan)
-    A, gains = jax.jit(ekf.information)(model, belief.mean, junk, weights)
-    H = central(lambda e: measure(model, retract(model, belief.mean, e), landmarks), np.zeros(6))
-    R = np.asarray(noise(model, belief.mean, landmarks))
-    shares = [w * h.T @ np.linalg.inv(r) for w, h, r in zip(weights, H, R, strict=True)]
-    expected = sum(share @ h for share, h in zip(shares, H, strict=True))
-    np.testing.assert_allclose(A, expected, atol=1e-7 * np.abs(expected).max())
-    np.testing.assert_allclose(gains, np.stack(shares), atol=1e-7 * np.abs(shares).max())
-
-
 def test_an_update_that_overflows_is_not_taken():
     model, belief = sextant()
     landmarks, observed, mask, _ = sextant_frames()
