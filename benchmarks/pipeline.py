@@ -9,7 +9,8 @@ that it is lost and starts anew. `p99` and `max` are of the time between two pos
 Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 52 frames a second, the slowest frame 86 ms, filter 30 % of the
 time; 640 x 480 video 42 to 63, 752 x 480 69, KITTI 36. 120 frames a second, 30 ms and 5 % are asked: the slowest frames
 are those of a start or restart (relative pose by maximum likelihood), optical flow takes 9 to 13 ms a frame beside the
-decoding, the filter 4 to 6. With patches followed anchor by anchor, and no thread that decodes, it was 16 ms more.
+decoding, the filter 4 to 6. Patches followed anchor by anchor took 27 ms of optical flow where one call takes 15
+(kitchen, beside other load).
 """
 
 import tempfile

@@ -353,8 +353,9 @@ class SinglePair:
         fresh = frame.fresh | (frame.ids != self._ids)
         over = np.asarray(self.state.inside) & (fresh | ~frame.visible)
         self._structure.end(self.state.structure, over, self._ids)
-        arrays = frame.u, frame.visible, fresh
-        self.state, report = _segment_step(self.settings, self.state, *arrays, dt, quality=frame.quality)
+        self.state, report = _segment_step(
+            self.settings, self.state, frame.u, frame.visible, fresh, dt, quality=frame.quality
+        )
         self._history.append((frame, report.pose, report.covariance))
         return report
 

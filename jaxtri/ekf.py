@@ -236,12 +236,11 @@ def _measuring(
     items = prepare(model, items, mask)
     if isinstance(items, Moments):
         assert isinstance(model, Projective)
-        support = model.support
 
         def at(prior: Mean, delta: Array, observed: Array, mask: Array, scale: Array | None) -> Evidence:
-            return moments.linearise(model, prior, delta, items, observed, mask, scale, support)
+            return moments.linearise(model, prior, delta, items, observed, mask, scale)
 
-        return at, support
+        return at, model.support
     items = stand_in(mask, items)
     return lambda prior, delta, *frame: _linearise(model, prior, delta, items, *frame), np.arange(d)
 

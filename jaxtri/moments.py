@@ -156,9 +156,9 @@ def linearise(
     observed: Float[Array, "n 2"],
     mask: Bool[Array, " n"],
     scale: Float[Array, " n"] | None,
-    support: np.ndarray,
 ) -> Evidence:
-    """At `retract(prior, delta)`; derivatives with respect to the `support` of the error of the prior."""
+    """At `retract(prior, delta)`; derivatives with respect to the model's `support` of the error of the prior."""
+    support = model.support
 
     def at(error: Array) -> tuple[Array, Array]:
         M = model.matrix(model.retract(prior, delta + embed(error, support, len(delta))))

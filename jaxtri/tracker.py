@@ -273,8 +273,9 @@ def step(
     model = _model(settings, state.depth)
     predicted = ekf.predict(model, state.belief, dt)
     mask, scale = tracks.usable, noise_scale(settings, quality)
+    items = moments.prepare(model, ekf.stand_in(mask, tracks.base))
     updated, diagnostics = ekf.update(
-        model, predicted, tracks.base, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
+        model, predicted, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
     )
     dt = jnp.asarray(dt, observed.dtype)
     belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, mask, state.coasted)
@@ -284,7 +285,7 @@ def step(
         state.sensitivity,
         ekf.transition(model, state.belief.mean, dt),
         belief.covariance,
-        *_owed(model, belief.mean, tracks, weights, scale, state.sensitivity.shape[1] // 6),
+        *_owed(model, belief.mean, items, tracks, weights, scale, state.sensitivity.shape[1] // 6),
     )
     visible = visible & ~drop
     tracks = _only(tracks, ~drop)
@@ -315,14 +316,19 @@ def step(
 
 
 def _owed(
-    model: BasePairs, mean: Twist, tracks: Tracks, weights: Float[Array, " n"], scale: Float[Array, " n"] | None, k: int
+    model: BasePairs,
+    mean: Twist,
+    items: moments.Moments,
+    tracks: Tracks,
+    weights: Float[Array, " n"],
+    scale: Float[Array, " n"] | None,
+    k: int,
 ) -> tuple[Float[Array, "6 6"], Float[Array, "6 s"]]:
     """What the measurements of an update say of the pose, and of the pose together with k keyframes."""
     mask = weights > 0
-    items = moments.prepare(model, ekf.stand_in(mask, tracks.base))
     scale = ekf.replace_masked(mask, scale, 1.0)
     zero, unmeasured = jnp.zeros(12, weights.dtype), jnp.zeros_like(tracks.first)
-    said = moments.linearise(model, mean, zero, items, unmeasured, mask, scale, model.support)
+    said = moments.linearise(model, mean, zero, items, unmeasured, mask, scale)
     levers = jnp.where(mask[:, None, None], tracks.lever, 0.0)
     A, _ = said.normal_equations(weights)
     first, second = (said.coupling(weights, levers[..., 6 * j : 6 * j + 6], tracks.slots[:, j], k) for j in (0, 1))

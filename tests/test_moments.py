@@ -129,7 +129,7 @@ def test_what_items_say_of_the_state_and_what_their_points_owe(experiment):
     weights = jax.random.uniform(keys[1], POINTS).at[3].set(0.0)
     groups = jax.random.randint(keys[2], POINTS, -1, 4)
     prepared, none = moments.prepare(model, items), jnp.zeros((POINTS, 2))
-    said = moments.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None, model.support)
+    said = moments.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None)
 
     def one(item, lever):
         H = jax.jacfwd(lambda e: model.measure(model.retract(mean, e), item))(jnp.zeros(12))

@@ -123,22 +123,22 @@ class KLT:
             return
         # All patches side by side in one image, whatever the frame they come from: one call follows them all.
         patches, centre = _mosaic(self._patches[slots])
-        now, _ = _mosaic(self._cut(gray, self._pixels[slots]))
-        origin = self._anchor_pixels[slots]
-        place, guess = centre + origin - np.rint(origin), self._pixels[slots]
+        origin, guess = self._anchor_pixels[slots], self._pixels[slots]
+        present = self._cut(gray, guess)
+        now, _ = _mosaic(present)
+        place = centre + origin - np.rint(origin)
         offset = np.rint(guess) - centre
         moved, ok, fb, smaller = self._flow(patches, now, place, guess - offset, 0)
         moved = moved + offset
         ok &= np.linalg.norm(moved - guess, axis=1) < self.settings.anchor_move
         self._pixels[slots[ok]] = moved[ok]
         error[slots[ok]], eigenvalue[slots[ok]] = fb[ok], smaller[ok]
-        self._set_anchor(slots[~ok], gray)
+        self._set_anchor(slots[~ok], present[~ok])
 
-    def _set_anchor(self, slots: np.ndarray, gray: np.ndarray) -> None:
-        if slots.size:
-            self._anchor[slots] = self._frame
-            self._anchor_pixels[slots] = self._pixels[slots]
-            self._patches[slots] = self._cut(gray, self._pixels[slots])
+    def _set_anchor(self, slots: np.ndarray, patches: np.ndarray) -> None:
+        self._anchor[slots] = self._frame
+        self._anchor_pixels[slots] = self._pixels[slots]
+        self._patches[slots] = patches
 
     def _cut(self, gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         """Patches about the rounded pixels (n, 2): (n, side, side)."""
@@ -185,7 +185,7 @@ class KLT:
         self._alive[slots] = True
         self._ids[slots] = np.arange(self._next_id, self._next_id + slots.size)
         self._next_id += slots.size
-        self._set_anchor(slots, gray)
+        self._set_anchor(slots, self._cut(gray, corners))
         fresh[slots] = True
         return fresh
 
