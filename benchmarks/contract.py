@@ -73,7 +73,7 @@ def plot_growth(curves: Mapping[str, Mapping[int, float]], label: str, path: Pat
         axis.loglog(list(x), list(x.values()), "o-", label=name)
     axis.set(xlabel="points N", ylabel=label)
     axis.grid(alpha=0.3, which="both")
-    axis.legend()
+    axis.legend(loc="upper left")
     with atomic_path(path) as written:
         figure.savefig(written, dpi=120)
     plt.close(figure)

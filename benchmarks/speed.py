@@ -8,8 +8,14 @@ noise of the base points. `scan` and `default` are one call for all frames, `ste
 run in turns; ratios are medians over the rounds. The answer is checked against the plain form, which takes every
 item's own Jacobian, and against C++.
 
-Last answer (2 idle cores, JAX 0.10, --quick only): scan 5.3 times C++ at N = 30 and 4.0 at 300 (3 asked; C++ 23 us),
-step 31 and 13 times (9 asked at 300), `default` 2.9 times a single pass, answers apart by 4e-13.
+`batch` rows are 16 noise settings over one sequence, a run of them over a run alone: one after the other, four or all
+at once.
+
+Last answer (2 idle cores, JAX 0.10; N = 30, 100, 300, 1,000, 3,000, 10,000): scan 8.0, 7.1, 6.8, 4.9, 4.2, 2.4 times
+C++ (3 asked at 300; C++ 29 us), step 25, 19, 15, 7.8, 4.7, 2.7 times (9 asked at 300), answers apart by 2e-12;
+`default` 2.8 times a single pass (4), pose and bank 1.64 times pose (1.2), eight base frames 28 times; 10,000 points
+9.4 times 300 (17), growing from 1,000 with N^.70 (1.05). A run of a batch costs .88, 1.39, 1.02 (N = 30) and .94,
+.95, .77 (300) of one alone.
 """
 
 import ctypes
@@ -35,9 +41,11 @@ jax.config.update("jax_enable_x64", True)
 from jaxtri import ekf  # noqa: E402
 from jaxtri.geometry.pose import rotation_matrix  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, TrifocalState, start  # noqa: E402
+from jaxtri.scan import batch  # noqa: E402
 
 SIZES = (30, 100, 300, 1000, 3000, 10000)
 FRAMES = 91
+BATCH = 16  # runs
 NOISE = (1.7e-4, 0.015, 0.02)  # sigma, acceleration, angular acceleration
 
 
@@ -119,6 +127,16 @@ class Problem:
 
         return run
 
+    def batch(self, size: int) -> Callable[[], Any]:
+        """`scan` under `BATCH` noise settings, the points shared."""
+
+        def run(sigma: jax.Array) -> jax.Array:
+            model = eqx.tree_at(lambda m: m.sigma, self.model(False), sigma)
+            says = ekf.filter(model, self.belief, self.pairs, self.observed, self.seen, passes=1)[1]
+            return jnp.sum(says.log_likelihood)
+
+        return partial(jax.jit(lambda x: batch(run, x, size)), NOISE[0] * jnp.linspace(0.5, 2, BATCH))
+
 
 def answer(beliefs: ekf.Belief[TrifocalState]) -> Answer:
     """Of our filter."""
@@ -160,6 +178,14 @@ def beside(seed: int, points: int, rounds: int) -> dict[str, float]:
     }
 
 
+def in_batches(seed: int, points: int, rounds: int) -> dict[str, float]:
+    """A run of a batch, over a run alone: one after the other, four at once, all at once."""
+    problem = Problem(seed, points)
+    runs: dict[str, Callable[[], Any]] = {f"batch{size}": problem.batch(size) for size in (1, 4, BATCH)}
+    seconds = in_turns({"alone": problem.scan(1, False), **runs}, rounds)
+    return {f"{k}_over_scan_n{points}": float(np.median(seconds[k] / seconds["alone"])) / BATCH for k in runs}
+
+
 def main() -> None:
     args = parser("What does a frame of the filter cost, over the same update written in C++?").parse_args()
     sizes, rounds = ((30, 300), 5) if args.quick else (SIZES, 25)
@@ -197,6 +223,8 @@ def main() -> None:
         figures["t10000_over_t300"] = micro["scan"][10000] / micro["scan"][300]
     print("\nmicroseconds a frame\n" + table(["N", *micro, "scan / C++", "step / C++"], rows))
     if not args.quick:
+        for n in (30, 300):
+            figures |= in_batches(args.seed, n, rounds // 3)
         figures |= beside(args.seed, 300, rounds)
     print("\n" + table(["", ""], [[k, f"{v:.3g}"] for k, v in figures.items() if "over_cpp" not in k]))
     if args.plots is not None:

@@ -7,7 +7,7 @@ Conventions, written here once:
   `T_camera_world`. Trajectories and their files are camera to world, named `T_world_camera`.
 - The filters work in normalised image coordinates (intrinsics and distortion removed). Pixels exist in
   `Camera` and `jaxtri.vision` only; the centre of the top-left pixel is (0, 0). Noise is given in pixels.
-- Array axes: frame t, point n, component. Functions take one item; batch them with `jax.vmap`.
+- Array axes: frame t, point n, component. Functions take one item; batch them with `jax.vmap`, whole runs with `batch`.
 - Angles are in radians, time in frames unless a `dt` is given, lengths in units of the scene.
 - The scale of a monocular reconstruction is a gauge, fixed by the length of the first base line.
 - Missing is False in a boolean mask; what stands in a masked entry changes nothing, NaN included.
@@ -39,6 +39,7 @@ from jaxtri.models.motion import Kinematics, Twist
 from jaxtri.models.structure_and_motion import StructureAndMotion
 from jaxtri.models.trifocal import Trifocal, TrifocalState
 from jaxtri.models.two_step import TwoStep
+from jaxtri.scan import batch
 from jaxtri.tracker import Settings, Status
 from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
 from jaxtri.two_view import TwoView, refine
@@ -77,6 +78,7 @@ __all__ = [
     "VideoError",
     "align",
     "ate_rmse",
+    "batch",
     "ekf",
     "evaluate",
     "filtering_bound",

@@ -1,4 +1,4 @@
-"""A scan over frames whose reverse gradient keeps little: checkpointed frame by frame, and block by block."""
+"""Over frames, with a reverse gradient that keeps little, and over whole runs: sequences, noise settings, trials."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,6 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
+
+from jaxtri.errors import InputError
 
 
 def checkpointed(
@@ -29,3 +31,21 @@ def checkpointed(
         carry, ys = jax.lax.scan(body, carry, jax.tree.map(lambda x: x[whole:], xs))
         found.append(ys)
     return carry, found[0] if len(found) == 1 else jax.tree.map(lambda *y: jnp.concatenate(y), *found)
+
+
+def batch(run: Callable[[Any], Any], inputs: PyTree, size: int | None = None) -> PyTree:
+    """`run(x)` of every x along the leading axis of `inputs`, stacked: sequences, noise settings, trials.
+
+    `size` of them run at once (`jax.vmap`), one batch after the other, for memory that is that of one batch. By
+    default one on a CPU, where more at once are from two fifths slower to a fifth faster (`benchmarks/speed.py`), and
+    all on an accelerator. What the runs share, as the points of a sequence that is run with many noises, `run` closes
+    over: it is kept once. Goes through `jit` and `grad`. Raises `InputError` for a size below 1.
+    """
+    count = jax.tree.leaves(inputs)[0].shape[0]
+    automatic = 1 if jax.default_backend() == "cpu" else count
+    at_once = automatic if size is None else size
+    if at_once < 1:
+        raise InputError(f"batches of {at_once} runs: give at least 1, or None for the machine's own")
+    if at_once >= count:
+        return jax.vmap(run)(inputs)
+    return jax.lax.map(run, inputs, batch_size=None if at_once == 1 else at_once)
