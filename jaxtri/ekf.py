@@ -270,7 +270,11 @@ def regression(P: Float[Array, "d d"], cross: Float[Array, "d e"]) -> Float[Arra
     return (found / s[:, None]).T
 
 
-_Factors = tuple[Float[Array, "s s"], Int[Array, " s"]]
+class _Inverse(NamedTuple):
+    """(I + A P)^-1 of the support, and log det (I + A P)."""
+
+    matrix: Float[Array, "s s"]
+    log_det: Float[Array, ""]
 
 
 class _Prior(NamedTuple):
@@ -278,7 +282,7 @@ class _Prior(NamedTuple):
 
     In coordinates scaled by the prior's standard deviations: without, float32 does not survive. A alone is never
     inverted (a scale it does not see leaves it rank deficient), nor is P (a pinned direction has no uncertainty),
-    but I + A P of the support, whose factors are handed on.
+    but I + A P of the support: once, all else is products.
     """
 
     P: Float[Array, "d d"]
@@ -296,34 +300,36 @@ class _Prior(NamedTuple):
         s = self.scales[self.support]
         return A * jnp.outer(s, s)
 
-    def factors(self, A: Float[Array, "s s"]) -> _Factors:
-        M = jnp.eye(len(A), dtype=A.dtype) + self._scaled(A) @ self.rows[:, self.support]
-        return jax.scipy.linalg.lu_factor(M)
+    def inverse(self, A: Float[Array, "s s"]) -> _Inverse:
+        """What the three below share."""
+        eye = jnp.eye(len(A), dtype=A.dtype)
+        factors = jax.scipy.linalg.lu_factor(eye + self._scaled(A) @ self.rows[:, self.support])
+        log_det = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(factors[0]))))
+        return _Inverse(jax.scipy.linalg.lu_solve(factors, eye), log_det)
 
-    def error(self, factors: _Factors, b: Float[Array, " s"]) -> Float[Array, " d"]:
+    def error(self, inverse: _Inverse, b: Float[Array, " s"]) -> Float[Array, " d"]:
         """(P^-1 + A)^-1 b."""
-        return jax.scipy.linalg.lu_solve(factors, b * self.scales[self.support]) @ self.rows * self.scales
+        return inverse.matrix @ (b * self.scales[self.support]) @ self.rows * self.scales
 
-    def posterior(self, A: Float[Array, "s s"], factors: _Factors) -> tuple[Float[Array, "d d"], Float[Array, ""]]:
-        """(P^-1 + A)^-1, and log det (I + P A).
+    def posterior(self, A: Float[Array, "s s"], inverse: _Inverse) -> Float[Array, "d d"]:
+        """(P^-1 + A)^-1.
 
-        With G = P (I + A P)^-1 the former is P - G A P. Written as a sum of squares,
+        With G = P (I + A P)^-1 it is P - G A P. Written as a sum of squares,
         (I - G A) P (I - G A)' + G A G', which is Joseph's form, it stays positive when G is off by rounding: in
         float32 the difference does not.
         """
         A, d = self._scaled(A), len(self.P)
-        G = self.rows.T @ jax.scipy.linalg.lu_solve(factors, jnp.eye(len(A), dtype=A.dtype))
+        G = self.rows.T @ inverse.matrix
         GA = G @ A
         left = jnp.eye(d, dtype=A.dtype) - moments.embed(GA, self.support, d)
         covariance = left @ self.P @ left.T + GA @ G.T
-        log_det = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(factors[0]))))
-        return (covariance + covariance.T) / 2 * jnp.outer(self.scales, self.scales), log_det
+        return (covariance + covariance.T) / 2 * jnp.outer(self.scales, self.scales)
 
 
 def posterior_error(P: Float[Array, "d d"], A: Float[Array, "d d"], b: Float[Array, " d"]) -> Float[Array, " d"]:
     """(P^-1 + A)^-1 b, for a P that may be singular."""
     prior = _Prior.of(P, np.arange(len(P)))
-    return prior.error(prior.factors(A), b)
+    return prior.error(prior.inverse(A), b)
 
 
 class _Pass(NamedTuple):
@@ -331,7 +337,7 @@ class _Pass(NamedTuple):
 
     optimal: Float[Array, " d"]  # the error that is best by it
     A: Float[Array, "s s"]
-    factors: _Factors
+    inverse: _Inverse
     weights: Float[Array, " n"]
     used: Bool[Array, " n"]
     distance: Float[Array, " n"]  # of the items once the error is corrected
@@ -420,8 +426,8 @@ def update(
         A, b = evidence.normal_equations(weights)
         at = delta[support]
         b = b + A @ at
-        factors = prior.factors(A)
-        optimal = prior.error(factors, b)
+        inverse = prior.inverse(A)
+        optimal = prior.error(inverse, b)
         # nu' S^-1 nu without S: by the solution's own normal equations, free of cancellation.
         best = optimal[support]
         left = distance = evidence.distance_after(best - at)
@@ -429,14 +435,14 @@ def update(
             distance = evidence.distance_after(correct(optimal)[support] - at)
         nis = jnp.sum(jnp.where(used, left, 0.0)) + best @ (b - A @ best)
         log_det = jnp.sum(jnp.where(used, evidence.log_det, 0.0))
-        return _Pass(optimal, A, factors, weights, used, distance, log_det, nis)
+        return _Pass(optimal, A, inverse, weights, used, distance, log_det, nis)
 
     # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
     k, zero = jnp.zeros((), jnp.int32), jnp.zeros(d, dtype)
     last = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(iterate, k, zero))
     last = jax.lax.fori_loop(0, passes, lambda k, found: iterate(k, found.optimal), last)
-    optimal, A, factors, weights, used, distance, noise_log_det, nis = last
-    covariance, log_det = prior.posterior(A, factors)
+    optimal, A, inverse, weights, used, distance, noise_log_det, nis = last
+    covariance = prior.posterior(A, inverse)
     final = correct(optimal)
     if considered is not None:
         # The gain of all other components is the optimal one, and so is what they have in common with these.
@@ -447,7 +453,7 @@ def update(
     reset = change_of_origin(model, mean, final, moved)
     posterior = Belief(moved, reset @ covariance @ reset.T)
 
-    log_det = log_det + noise_log_det
+    log_det = inverse.log_det + noise_log_det
     constant = observed.shape[1] * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
     diagnostics = Diagnostics(
         log_likelihood=-(nis + log_det + constant) / 2,
