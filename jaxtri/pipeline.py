@@ -4,6 +4,7 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -53,7 +54,7 @@ def track(
 ) -> Run:
     """Recover the camera's trajectory from the frames of a source, one pass, in order.
 
-    Frames are decoded by a thread of their own while others are followed.
+    Frames are decoded by a thread of their own, and their features followed by another, while others are filtered.
 
     With `record` the run can be differentiated: `run.odometry.recording()` and `jaxtri.replay`.
     An interrupt (Ctrl-C) ends the sequence there; what was tracked so far is kept. Raises
@@ -68,18 +69,37 @@ def track(
     interrupted = False
     milliseconds: list[float] = []
     began = clock = time.perf_counter()
+
+    def follow(image: np.ndarray) -> FrameTracks:
+        begun = time.perf_counter()
+        tracks = follower.track(image)
+        seconds["optical flow"] += time.perf_counter() - begun
+        return tracks
+
     try:
-        with contextlib.closing(ahead(islice(source, max_frames))) as frames:
-            for frame in frames:
-                got = time.perf_counter()
+        # A frame is filtered while the next one is followed already. What the filter gives up of it the next one shows
+        # no more, and its slots are free from the one after that on: the same whichever of the two is faster.
+        with contextlib.closing(ahead(islice(source, max_frames))) as frames, ThreadPoolExecutor(1) as pool:
+
+            def following() -> tuple[Frame, Future[FrameTracks]] | None:
+                begun = time.perf_counter()
+                frame = next(frames, None)
+                seconds["waiting for frames"] += time.perf_counter() - begun
+                if frame is None:
+                    return None
                 _same_size(camera, frame)
-                tracks = follower.track(frame.image)
+                return frame, pool.submit(follow, frame.image)
+
+            outliers, now = np.zeros(0, np.int64), following()
+            while now is not None:
+                frame, tracks = now[0], now[1].result()
+                follower.drop(outliers)
+                now = following()
+                begun = time.perf_counter()
+                tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers))
                 _sample(colours, tracks, frame.image)
-                followed = time.perf_counter()
-                follower.drop(tracker.add(tracks, frame.time_s))
-                filtered = time.perf_counter()
-                for part, took in zip(seconds, (got - clock, followed - got, filtered - followed), strict=True):
-                    seconds[part] += took
+                outliers = tracks.ids[tracker.add(tracks, frame.time_s)]
+                seconds["filter"] += time.perf_counter() - begun
                 bar.set_postfix_str(f"{tracker.status.name.lower()}, {tracker.poses[-1].used} points", refresh=False)
                 bar.update()
                 milliseconds.append(1e3 * (time.perf_counter() - clock))
@@ -123,7 +143,8 @@ def warm_up(
     everything = np.ones((6, n), bool)
     shift = np.zeros((6, n, 2))
     shift[..., 0] = 0.04 * w * np.arange(6)[:, None] / depth
-    follow_tracks(camera, pixels + shift, everything, base=base, settings=settings, start=start)
+    odometry = follow_tracks(camera, pixels + shift, everything, base=base, settings=settings, start=start)
+    odometry.points()
 
 
 def follow_tracks(

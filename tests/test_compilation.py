@@ -60,7 +60,7 @@ def test_nothing_is_compiled_once_the_camera_is_followed():
         for frame, _ in zip(source, range(90), strict=False):
             tracks = klt.track(frame.image)
             before = len(compiled)
-            klt.drop(odometry.add(tracks, frame.time_s))
+            klt.drop(tracks.ids[odometry.add(tracks, frame.time_s)])
             frames.append((odometry.segments, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
     segments, keyframes, programs, fresh = map(np.array, zip(*frames, strict=True))
     followed = np.flatnonzero(segments)[2:]

@@ -63,7 +63,7 @@ def test_features_are_spread_over_the_image():
 def test_outliers_given_up_free_their_slots():
     klt = KLT(SETTINGS)
     first = klt.track(texture())
-    klt.drop(first.visible)
+    klt.drop(first.ids[first.visible])
     second = klt.track(texture())
     assert second.fresh.sum() == second.visible.sum() > 100
     assert set(second.ids[second.visible]).isdisjoint(first.ids)

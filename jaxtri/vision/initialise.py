@@ -110,10 +110,11 @@ def _refine(
     u1: Float[Array, "n 2"],
     u2: Float[Array, "n 2"],
     mask: Bool[Array, "h n"],
+    wanted: Bool[Array, " h"],
     common: Bool[Array, " n"],
     sigma: Float[Array, ""],
 ) -> _Refined:
-    """Every hypothesis refined on its own tracks, then judged on all common ones."""
+    """Every wanted hypothesis refined on its own tracks, then judged on all common ones; others cost infinity."""
 
     def one(R: Array, T: Array, mask: Array) -> _Refined:
         pose = two_view.refine(T, SO3.from_matrix(R), u1, u2, mask, sigma)
@@ -125,8 +126,16 @@ def _refine(
         angle = jax.vmap(lambda a, b: parallax(a, b, R))(u1, u2)
         return _Refined(pose, cost, inside, jnp.nanmedian(jnp.where(inside, angle, jnp.nan)))
 
+    def refine(hypothesis: tuple[Array, Array, Array, Array]) -> _Refined:
+        wanted, *others = hypothesis
+        shapes = jax.eval_shape(one, *others)
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(
+            cost=jnp.asarray(jnp.inf, R.dtype)
+        )
+        return jax.lax.cond(wanted, one, lambda *_: nothing, *others)
+
     # A loop, not a batch: it compiles in half the time, and this is what a first run waits for.
-    return jax.lax.map(lambda h: one(*h), (R, T, mask))
+    return jax.lax.map(refine, (wanted, R, T, mask))
 
 
 def hypotheses(
@@ -153,19 +162,32 @@ def hypotheses(
         poses += poselib_poses(a, b, threshold) + homography_poses(a, b, threshold)
     if not poses:
         return []
+    wanted = np.arange(HYPOTHESES) < len(poses)
     poses = (poses + [poses[0]] * HYPOTHESES)[:HYPOTHESES]
     R, T = (jnp.asarray(np.stack(x), sigma.dtype) for x in zip(*poses, strict=True))
     first, second = (jnp.asarray(np.where(mask[:, None], u, 0), sigma.dtype) for u in (u1, u2))
     common = jnp.asarray(mask)
-    rough = _refine(R, T, first, second, jnp.broadcast_to(common, (HYPOTHESES, len(mask))), common, sigma)
-    fine = _refine(rough.pose.rotation.as_matrix(), rough.pose.translation, first, second, rough.inside, common, sigma)
-    cost = np.where(np.isfinite(np.asarray(fine.cost)), np.asarray(fine.cost), np.inf)
-    found: list[Hypothesis] = []
+    rough = _refine(R, T, first, second, jnp.broadcast_to(common, (HYPOTHESES, len(mask))), wanted, common, sigma)
+    # Those that have come to the same end are refined once, and so is none that explains much less than the best.
+    wanted = np.isin(np.arange(HYPOTHESES), [k for k, _ in _distinct(rough, worst=4.0)])
+    R = rough.pose.rotation.as_matrix()
+    fine = _refine(R, rough.pose.translation, first, second, rough.inside, wanted, common, sigma)
+    degrees = np.rad2deg(fine.parallax)
+    return [
+        Hypothesis(jax.tree.map(jnp.asarray, pose), float(fine.cost[k]), np.asarray(fine.inside[k]), float(degrees[k]))
+        for k, pose in _distinct(fine)
+    ]
+
+
+def _distinct(refined: _Refined, worst: float = np.inf) -> list[tuple[int, two_view.TwoView]]:
+    """Hypotheses that differ, the cheapest first, with their index; none that costs `worst` times the best and more."""
+    cost, poses = np.asarray(refined.cost), jax.tree.map(np.asarray, refined.pose)
+    found: list[tuple[int, two_view.TwoView]] = []
     for k in np.argsort(cost):
-        pose = jax.tree.map(lambda x, k=k: x[k], fine.pose)
-        if np.isfinite(cost[k]) and all(_apart(pose, h.pose) for h in found):
-            degrees = float(np.rad2deg(fine.parallax[k]))
-            found.append(Hypothesis(pose, float(cost[k]), np.asarray(fine.inside[k]), degrees))
+        pose = jax.tree.map(lambda x, k=k: x[k], poses)
+        affordable = np.isfinite(cost[k]) and cost[k] <= worst * max(np.min(cost), 1.0)
+        if affordable and all(_apart(pose, other) for _, other in found):
+            found.append((int(k), pose))
     return found
 
 

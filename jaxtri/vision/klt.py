@@ -96,9 +96,9 @@ class KLT:
         pixels, alive, ids = self._pixels.astype(np.float64), self._alive.copy(), self._ids.copy()
         return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue)
 
-    def drop(self, slots: np.ndarray) -> None:
-        """Give up the features of a boolean mask (n,): the filter found them to be outliers."""
-        self._alive &= ~slots
+    def drop(self, ids: np.ndarray) -> None:
+        """Give up the features of these numbers: the filter found them to be outliers."""
+        self._alive &= ~np.isin(self._ids, ids)
 
     def _flow(
         self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray, guess: np.ndarray | None, levels: int
