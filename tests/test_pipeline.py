@@ -20,7 +20,7 @@ from jaxtri.vision.video import open_source
 def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatch, slow):
     """That of one frame after the other, where a frame is followed before the filter has judged the one before it."""
     write_laboratory(tmp_path, 24, progress=False)
-    camera, klt = read_camera(tmp_path / "camera.json"), KLTSettings(capacity=128)
+    camera, klt = read_camera(tmp_path / "camera.json"), KLTSettings(capacity=100)
     settings = eqx.tree_at(lambda s: s.outlier, Settings.of(camera), jnp.asarray(0.03))  # gives up good points, too
     follower, odometry = KLT(klt), Odometry(camera, settings)
     outliers = [np.zeros(0, np.int64)] * 2
