@@ -7,11 +7,11 @@ compiled before. `demo` is the command line's, at 640 x 480; in `restart` the ca
 that it is lost and starts anew. `p99` and `max` are of the time between two poses, `filter` the share of it in which
 one is filtered; optical flow runs beside, in a thread of its own.
 
-Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 52 frames a second, the slowest frame 86 ms, filter 30 % of the
-time; 640 x 480 video 42 to 63, 752 x 480 69, KITTI 36. 120 frames a second, 30 ms and 5 % are asked: the slowest frames
-are those of a start or restart (relative pose by maximum likelihood), optical flow takes 9 to 13 ms a frame beside the
-decoding, the filter 4 to 6. Patches followed anchor by anchor took 27 ms of optical flow where one call takes 15
-(kitchen, beside other load).
+Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 82 frames a second (p99 23 ms, slowest 81), blinded 106 (the grey
+frames cost little), 640 x 480 video 57 to 89, 752 x 480 79, KITTI 44; the slowest frames, 55 to 132 ms, are those of a
+start or restart (relative pose by maximum likelihood). 120 frames a second, 30 ms and 5 % are asked. Optical flow takes
+7 to 14 ms a frame at 640 x 480, the filter 6 to 10 beside it: together they want more than two cores, alone the filter
+takes 4. One after the other, and looking back through all levels of the pyramid, the demo was at 52.
 """
 
 import tempfile
