@@ -11,11 +11,11 @@ item's own Jacobian, and against C++.
 `batch` rows are 16 noise settings over one sequence, a run of them over a run alone: one after the other, four or all
 at once.
 
-Last answer (2 idle cores, JAX 0.10; N = 30, 100, 300, 1,000, 3,000, 10,000): scan 8.0, 7.1, 6.8, 4.9, 4.2, 2.4 times
-C++ (3 asked at 300; C++ 29 us), step 25, 19, 15, 7.8, 4.7, 2.7 times (9 asked at 300), answers apart by 2e-12;
-`default` 2.8 times a single pass (4), pose and bank 1.64 times pose (1.2), eight base frames 28 times; 10,000 points
-9.4 times 300 (17), growing from 1,000 with N^.70 (1.05). A run of a batch costs .88, 1.39, 1.02 (N = 30) and .94,
-.95, .77 (300) of one alone.
+Last answer (2 idle cores, JAX 0.10; N = 30, 100, 300, 1,000, 3,000, 10,000): scan 7.3, 6.9, 6.1, 5.3, 3.0, 2.2 times
+C++ (3 asked at 300; C++ 30 us), step 25, 22, 14, 9.0, 4.1, 2.2 times (9 asked at 300), answers apart by 2e-12;
+`default` 2.9 times a single pass (4), pose and bank 1.53 times pose (1.2), eight base frames 31 times; 10,000 points
+8.2 times 300 (17), growing from 1,000 with N^.68 (1.05). A run of a batch costs .93, 1.17, .84 (N = 30) and .81, .87,
+.76 (300) of one alone; in an earlier run .88, 1.39, 1.02 and .94, .95, .77.
 """
 
 import ctypes
