@@ -35,7 +35,8 @@ import jax.numpy as jnp
 import numpy as np
 from contract import in_turns, parser, plot_growth, report, table
 from jaxlie import SO3
-from paper_filters import Estimate, draw, start_of
+from paper_filters import Estimate, draw
+from paper_filters import run as run_trial
 from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
@@ -225,14 +226,8 @@ class Problem:
         return run
 
     def with_structure(self) -> Callable[[], Estimate]:
-        """The default mode and its bank."""
-        f = start_of(self.e, self.view, "default")
-
-        def body(carry: Any, z: jax.Array) -> tuple[Any, Estimate]:
-            carry, said = f.step(carry, z)
-            return carry, f.read(carry, said.nis)
-
-        return partial(jax.jit(lambda carry, z: jax.lax.scan(body, carry, z)[1]), f.carry, f.observed)
+        """The default mode and its bank, from the two-view estimate on."""
+        return partial(jax.jit(partial(run_trial, method="default")), self.e, self.view)
 
 
 def factor(P: np.ndarray) -> np.ndarray:

@@ -301,7 +301,7 @@ class _Prior(NamedTuple):
         return A * jnp.outer(s, s)
 
     def inverse(self, A: Float[Array, "s s"]) -> _Inverse:
-        """What the three below share."""
+        """(I + A P)^-1 of the support, and the logarithm of |I + A P|."""
         eye = jnp.eye(len(A), dtype=A.dtype)
         factors = jax.scipy.linalg.lu_factor(eye + self._scaled(A) @ self.rows[:, self.support])
         log_det = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(factors[0]))))

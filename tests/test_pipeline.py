@@ -5,7 +5,6 @@ import time
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxtri.io import read_camera
 from jaxtri.odometry import Odometry
@@ -16,8 +15,7 @@ from jaxtri.vision.rendered import write_laboratory
 from jaxtri.vision.video import open_source
 
 
-@pytest.mark.parametrize("slow", [KLT.track, Odometry.add])
-def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatch, slow):
+def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatch):
     """That of one frame after the other, where a frame is followed before the filter has judged the one before it."""
     write_laboratory(tmp_path, 24, progress=False)
     camera, klt = read_camera(tmp_path / "camera.json"), KLTSettings(capacity=100)
@@ -31,13 +29,15 @@ def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatc
             tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers[-1]))
             outliers.append(tracks.ids[odometry.add(tracks, frame.time_s)])
     assert sum(map(len, outliers)) > 10
-
-    def late(self, *arguments):
-        time.sleep(0.02)
-        return slow(self, *arguments)
-
-    monkeypatch.setattr(KLT if slow is KLT.track else Odometry, slow.__name__, late)
-    with open_source(tmp_path) as source:
-        run = track(source, camera, settings=settings, klt=klt, progress=False)
     assert odometry.segments == 1
-    np.testing.assert_array_equal(run.trajectory.T_world_camera, odometry.trajectory().T_world_camera)
+
+    for owner, slow in (KLT, KLT.track), (Odometry, Odometry.add):
+
+        def late(self, *arguments, slow=slow):
+            time.sleep(0.02)
+            return slow(self, *arguments)
+
+        with monkeypatch.context() as patch, open_source(tmp_path) as source:
+            patch.setattr(owner, slow.__name__, late)
+            run = track(source, camera, settings=settings, klt=klt, progress=False)
+        np.testing.assert_array_equal(run.trajectory.T_world_camera, odometry.trajectory().T_world_camera)

@@ -169,25 +169,31 @@ def hypotheses(
     common = jnp.asarray(mask)
     rough = _refine(R, T, first, second, jnp.broadcast_to(common, (HYPOTHESES, len(mask))), wanted, common, sigma)
     # Those that have come to the same end are refined once, and so is none that explains much less than the best.
-    wanted = np.isin(np.arange(HYPOTHESES), [k for k, _ in _distinct(rough, worst=4.0)])
+    wanted = np.isin(np.arange(HYPOTHESES), _distinct(rough, worst=4.0))
     R = rough.pose.rotation.as_matrix()
     fine = _refine(R, rough.pose.translation, first, second, rough.inside, wanted, common, sigma)
-    degrees = np.rad2deg(fine.parallax)
     return [
-        Hypothesis(jax.tree.map(jnp.asarray, pose), float(fine.cost[k]), np.asarray(fine.inside[k]), float(degrees[k]))
-        for k, pose in _distinct(fine)
+        Hypothesis(
+            jax.tree.map(lambda x, k=k: x[k], fine.pose),
+            float(fine.cost[k]),
+            np.asarray(fine.inside[k]),
+            float(np.rad2deg(fine.parallax[k])),
+        )
+        for k in _distinct(fine)
     ]
 
 
-def _distinct(refined: _Refined, worst: float = np.inf) -> list[tuple[int, two_view.TwoView]]:
-    """Hypotheses that differ, the cheapest first, with their index; none that costs `worst` times the best and more."""
+def _distinct(refined: _Refined, worst: float = np.inf) -> list[int]:
+    """Which hypotheses differ, the cheapest first; none that costs more than `worst` times the best."""
     cost, poses = np.asarray(refined.cost), jax.tree.map(np.asarray, refined.pose)
-    found: list[tuple[int, two_view.TwoView]] = []
-    for k in np.argsort(cost):
-        pose = jax.tree.map(lambda x, k=k: x[k], poses)
-        affordable = np.isfinite(cost[k]) and cost[k] <= worst * max(np.min(cost), 1.0)
-        if affordable and all(_apart(pose, other) for _, other in found):
-            found.append((int(k), pose))
+    each = [jax.tree.map(lambda x, k=k: x[k], poses) for k in range(len(cost))]
+    order = np.argsort(cost)  # what is not a number comes last
+    dearest = worst * max(cost[order[0]], 1.0)
+    found: list[int] = []
+    for k in order:
+        affordable = np.isfinite(cost[k]) and cost[k] <= dearest
+        if affordable and all(_apart(each[k], each[other]) for other in found):
+            found.append(int(k))
     return found
 
 

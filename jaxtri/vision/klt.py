@@ -111,10 +111,11 @@ class KLT:
         # Without a guess the flow starts from standing still, as it would.
         flags = cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
         there, ok, eigenvalue = cv2.calcOpticalFlowPyrLK(a, b, origin, start, None, None, window, levels, stop, flags)
-        # Back by as many levels as the way there was long for nine in ten of the points.
-        moved = np.linalg.norm(there - origin, axis=2)[ok == 1]
-        length = np.quantile(moved, 0.9) / (s.window / 2) if levels and moved.size else 0.0
-        levels = min(levels, math.ceil(math.log2(max(length, 1.0))))
+        if levels:  # back by as many as the way there was long for nine in ten of the points
+            length = np.linalg.norm(there - origin, axis=2)[ok == 1]
+            length = length[np.isfinite(length)]
+            windows = np.quantile(length, 0.9) / (s.window / 2) if length.size else 1.0
+            levels = min(levels, math.ceil(math.log2(max(windows, 1.0))))
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, origin.copy(), None, None, window, levels, stop, flags)
         there, back = there.reshape(-1, 2), back.reshape(-1, 2)
         distance = np.linalg.norm(back - pixels, axis=1)
