@@ -3,8 +3,12 @@
 The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, and needs a decision, is here.
 """
 
+import math
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,7 +36,6 @@ from jaxtri.replay import Recording
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.trajectory import Trajectory
 from jaxtri.two_view import scaled
-from jaxtri.vision.initialise import Hypothesis
 from jaxtri.vision.klt import FrameTracks
 
 
@@ -60,6 +63,15 @@ class FramePose:
         return replace(self, T_camera_world=T, covariance=self.covariance * np.outer(s, s))
 
 
+class _Begun(NamedTuple):
+    """A start: its base pair, the filter that goes on from it, and the poses of the frames that waited for it."""
+
+    pair: Restart
+    follower: Follower
+    poses: dict[int, FramePose]
+
+
+CATCH_UP = 3  # frames taken in for each that comes, where some came while a start was worked out
 _normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
 _matrix = jax.jit(SE3.as_matrix)
 
@@ -72,6 +84,9 @@ class Odometry:
     the frames wait with the status INITIALISING; they are filled in when the first base pair stands. After a
     complete loss a new start follows, whose scale is unknown: it is set so that the scene is as deep as it
     was, and `scale_unknown_from` names the frame from which this is a guess.
+
+    A start takes as long as many frames, so it is worked out by a thread while the next `StartSettings.lag`
+    frames queue up; what comes out does not depend on that. `finish` takes in what is queued.
     """
 
     camera: Camera
@@ -94,6 +109,8 @@ class Odometry:
         self._start = self.start or StartSettings.of(self.base)
         self._waiting: list[Frame] = []  # frames that may still become a base pair
         self._passed: list[Frame] = []  # frames that no longer can
+        self._queue: deque[Frame] = deque()  # frames that are not taken in yet
+        self._search: Future[_Begun | str] | None = None  # of a base pair: the first and the last of those waiting
         self._follower: Follower | None = None
         self._points: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._tried = (-1, 0.0)
@@ -118,15 +135,35 @@ class Odometry:
         if self._recording:
             self._tracks.append(tracks._replace(visible=frame.visible))
         self.poses.append(FramePose(time, Status.LOST if self.segments else Status.INITIALISING))
-        if self._follower is None:
-            self._waiting.append(frame)
-            self._try_start()
-            return np.zeros(len(frame.visible), bool)
-        report = self._follower.follow(frame, self._dt(index))
-        self._record(frame, report.pose, report)
-        if self.poses[-1].status is Status.LOST:
-            self._lose(frame)
-        return np.asarray(report.drop)
+        self._queue.append(frame)
+        return np.isin(frame.ids, self._take_in(index, CATCH_UP))
+
+    def finish(self) -> None:
+        """Take in the frames that came while a start was worked out, which is waited for."""
+        self._take_in(math.inf, math.inf)
+
+    def _take_in(self, newest: float, most: float) -> np.ndarray:
+        """Up to `most` queued frames, in order, but none before a start is there; the numbers of tracks to give up."""
+        outliers = [np.zeros(0, np.int64)]
+        while True:
+            if self._search is not None:
+                if newest < self._waiting[-1].index + self._start.lag:
+                    break
+                self._settle(self._search)
+            if not self._queue or len(outliers) > most:
+                break
+            frame = self._queue.popleft()
+            if self._follower is None:
+                self.poses[frame.index].status = Status.LOST if self.segments else Status.INITIALISING
+                self._waiting.append(frame)
+                self._try_start()
+                continue
+            report = self._follower.follow(frame, self._dt(frame.index))
+            self.poses[frame.index] = _pose(frame, report.pose, report)
+            outliers.append(frame.ids[np.asarray(report.drop)])
+            if self.poses[frame.index].status is Status.LOST:
+                self._lose(frame)
+        return np.concatenate(outliers)
 
     @property
     def status(self) -> Status:
@@ -148,6 +185,7 @@ class Odometry:
 
         Raises `InitialisationError`, with the reason, where no frame has a pose.
         """
+        self.finish()
         known = [i for i, p in enumerate(self.poses) if p.T_camera_world is not None]
         if not known:
             raise InitialisationError(
@@ -172,6 +210,7 @@ class Odometry:
 
     def points(self) -> Points:
         """The points of all tracks so far, in the world frame, each as it was last known."""
+        self.finish()
         if self._follower is not None:
             _keep(self._points, self._follower.ended())
         known = self._points.copy()
@@ -190,6 +229,7 @@ class Odometry:
         """
         if not self.record:
             raise InputError("nothing was recorded: ask for it by record=True")
+        self.finish()
         if self._began is None:
             raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
         start, follower = self._began
@@ -232,16 +272,6 @@ class Odometry:
             return 1.0
         return (self.poses[index].time - self.poses[index - 1].time) / self.frame_time
 
-    def _record(self, frame: Frame, pose: SE3, report: Report | None, status: Status | None = None) -> None:
-        entry = self.poses[frame.index]
-        entry.T_camera_world = np.asarray(_matrix(pose), np.float64)
-        entry.covariance = np.zeros((6, 6)) if report is None else np.asarray(report.covariance, np.float64)
-        if report is not None:
-            entry.status = Status(int(report.status))
-            entry.used, entry.nis = int(report.diagnostics.used), float(report.diagnostics.nis)
-        if status is not None:
-            entry.status = status
-
     # -- starting ---------------------------------------------------------------------------------------------
 
     def _try_start(self) -> None:
@@ -267,14 +297,37 @@ class Odometry:
         if tried == first.index and flow < 1.1 * before:
             return
         self._tried = (first.index, flow)
-        found = find(self._settings, self._start, self._waiting)
-        self.reason = found.reason
-        if found.found is not None:
-            self._begin(self._waiting, found.found)
+        pool = ThreadPoolExecutor(1, thread_name_prefix="start")
+        self._search = pool.submit(self._begin, self._waiting, self._passed)
+        pool.shutdown(wait=False)
 
-    def _begin(self, frames: list[Frame], found: Hypothesis) -> None:
-        """Set up the filter from a base pair, and fill in the frames between and before."""
-        pose = found.pose
+    def _settle(self, search: Future[_Begun | str]) -> None:
+        """Go on from a start that was worked out beside, or without one."""
+        self._search = None
+        begun = search.result()
+        if isinstance(begun, str):
+            self.reason = begun
+            return
+        for index, pose in begun.poses.items():
+            self.poses[index] = pose
+        if self.segments == 0:
+            self._began = begun.pair, begun.follower
+            self.base_pair = begun.pair.first, begun.pair.second
+        elif self.scale_unknown_from is None:
+            self.scale_unknown_from = begun.pair.first
+        self._follower = begun.follower
+        self.segments += 1
+        self._waiting, self._passed = [], []
+
+    def _begin(self, frames: list[Frame], passed: list[Frame]) -> _Begun | str:
+        """The filter from a base pair, and the frames between and before filled in; or why it has to wait.
+
+        Other frames are queued meanwhile, so it only reads, and only what they do not change.
+        """
+        searched = find(self._settings, self._start, frames)
+        if searched.found is None:
+            return searched.reason
+        pose = searched.found.pose
         first, last = frames[0], frames[-1]
         again = self.segments > 0
         world = jax.tree.map(lambda x: x.astype(pose.translation.dtype), SE3.identity())
@@ -283,29 +336,24 @@ class Odometry:
             world = SE3.from_matrix(jnp.asarray(held, pose.translation.dtype))
             state, _ = fill(self._settings, [first, last], pose, world, [1.0])
             pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
-            self.scale_unknown_from = self.scale_unknown_from or first.index
-        else:
-            self.base_pair = (first.index, last.index)
         state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
-        self._record(first, world, None, Status.RESTARTED if again else Status.TRACKING)
-        for frame, report in [*reports, *self._backwards(first, state, world)]:
-            self._record(frame, report.pose, report)
+        poses = {first.index: _pose(first, world, None, Status.RESTARTED if again else Status.TRACKING)}
+        for frame, report in [*reports, *self._backwards(first, passed, state, world)]:
+            poses[frame.index] = _pose(frame, report.pose, report)
         if self.base is Base.TRACKS:
-            self._follower = TrackPairs(self._settings, state, last, first.common(last))
+            follower: Follower = TrackPairs(self._settings, state, last, first.common(last))
         else:
-            self._follower = SinglePair(self._settings, self._start, self.base, frames, pose, world)
-        if not again:
-            self._began = Restart(first.index, last.index, first.index, found.pose, found.inside), self._follower
-        self.segments += 1
-        self._waiting, self._passed = [], []
+            follower = SinglePair(self._settings, self._start, self.base, frames, pose, world)
+        pair = Restart(first.index, last.index, first.index, searched.found.pose, searched.found.inside)
+        return _Begun(pair, follower, poses)
 
-    def _backwards(self, first: Frame, state, world: SE3) -> Iterator[tuple[Frame, Report]]:
+    def _backwards(self, first: Frame, passed: list[Frame], state, world: SE3) -> Iterator[tuple[Frame, Report]]:
         """Frames that waited before the first base frame, newest first, as far as its tracks reach."""
         mean = eqx.tree_at(
             lambda m: (m.pose, m.twist), state.belief.mean, (world, jnp.zeros_like(state.belief.mean.twist))
         )
         state = state._replace(belief=eqx.tree_at(lambda b: b.mean, state.belief, mean))
-        for frame in reversed(self._passed):
+        for frame in reversed(passed):
             state, report = hold(self._settings, state, frame, first.common(frame), 1.0)
             if int(report.status) != Status.TRACKING:
                 return
@@ -315,6 +363,8 @@ class Odometry:
         """The camera is lost: start again from here."""
         assert self._follower is not None
         self._changes += len(self._follower.begun)
+        if self._recording:
+            del self._tracks[frame.index + 1 :]
         self._recording = False
         self._depth = self._follower.depth
         for points in (self._follower.ended(), self._follower.present()):
@@ -322,6 +372,15 @@ class Odometry:
         self._follower = None
         self._waiting, self._tried = [frame], (-1, 0.0)
         self.reason = "too few points agreed with any motion"
+
+
+def _pose(frame: Frame, pose: SE3, report: Report | None, status: Status | None = None) -> FramePose:
+    found = FramePose(frame.time, status or Status.TRACKING, np.asarray(_matrix(pose), np.float64), np.zeros((6, 6)))
+    if report is not None:
+        found.covariance = np.asarray(report.covariance, np.float64)
+        found.status = Status(int(report.status))
+        found.used, found.nis = int(report.diagnostics.used), float(report.diagnostics.nis)
+    return found
 
 
 def _keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> None:

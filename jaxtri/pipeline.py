@@ -104,6 +104,7 @@ def track(
                 bar.update()
                 milliseconds.append(1e3 * (time.perf_counter() - clock))
                 clock = time.perf_counter()
+        tracker.finish()
     except KeyboardInterrupt:
         interrupted = True
     finally:
@@ -171,6 +172,7 @@ def follow_tracks(
     for t, (z, seen) in enumerate(zip(pixels, visible, strict=True)):
         odometry.add(FrameTracks(z, seen, seen & ~before, ids, unknown, unknown), float(times[t]))
         before = seen
+    odometry.finish()
     return odometry
 
 

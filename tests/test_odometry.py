@@ -1,5 +1,6 @@
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from tracks import CAPACITY, make, sideways
@@ -140,18 +141,25 @@ def test_what_stands_in_masked_tracks_changes_nothing():
     np.testing.assert_array_equal(claimed.trajectory().T_world_camera, clean.T_world_camera)
 
 
-def test_a_complete_loss_starts_anew_and_says_that_the_scale_is_unknown():
+def covered(**start) -> Odometry:
+    """A run whose lens is covered for a while; what comes after it has nothing to do with what was before."""
     first, second = sideways(20), sideways(45, seed=5)
     pixels = np.concatenate([first.pixels, second.pixels])
     visible = np.concatenate([first.visible, second.visible])
     visible[20:24] = False  # the lens is covered for a while
     ids = np.repeat(np.arange(2), [20, 45])[:, None] * CAPACITY + np.arange(CAPACITY)
-    odometry = Odometry(first.camera)
+    odometry = Odometry(first.camera, start=StartSettings.of(Base.TRACKS, **start), record=True)
     before = np.full(CAPACITY, -1)
     for k in range(65):
         fresh = visible[k] & (ids[k] != before)
         before = np.where(visible[k], ids[k], -1)
         odometry.add(bases_tracks(pixels[k], visible[k], fresh, ids[k]), float(k))
+    odometry.finish()
+    return odometry
+
+
+def test_a_complete_loss_starts_anew_and_says_that_the_scale_is_unknown():
+    odometry = covered()
     status = [p.status for p in odometry.poses]
     assert status[:20] == [Status.TRACKING] * 20
     assert status[20:24] == [Status.LOST] * 4
@@ -160,6 +168,26 @@ def test_a_complete_loss_starts_anew_and_says_that_the_scale_is_unknown():
     assert odometry.segments == 2
     assert odometry.scale_unknown_from == 24
     assert np.isfinite(odometry.trajectory().T_world_camera).all()
+
+
+def test_frames_that_come_while_a_start_is_worked_out_change_nothing():
+    at_once = covered(lag=0)
+    for lag in (5, 100):
+        late = covered(lag=lag)
+        assert [p.status for p in late.poses] == [p.status for p in at_once.poses]
+        assert (late.base_pair, late.scale_unknown_from) == (at_once.base_pair, at_once.scale_unknown_from)
+        results = ((o.trajectory().T_world_camera, o.points(), o.recording()) for o in (at_once, late))
+        jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+def test_an_error_while_a_start_is_worked_out_is_raised(monkeypatch):
+    def fail(*_):
+        raise MemoryError("no room")
+
+    monkeypatch.setattr("jaxtri.odometry.find", fail)
+    tracks = sideways(20)
+    with pytest.raises(MemoryError, match="no room"):
+        follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
 
 
 def test_frames_that_make_no_sense_are_coasted_over():
