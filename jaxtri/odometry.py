@@ -71,7 +71,7 @@ class _Begun(NamedTuple):
     poses: dict[int, FramePose]
 
 
-CATCH_UP = 3  # frames taken in for each that comes, where some came while a start was worked out
+CATCH_UP = 2  # frames taken in for each that comes, where some came while a start was worked out
 _normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
 _matrix = jax.jit(SE3.as_matrix)
 
