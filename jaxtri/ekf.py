@@ -438,8 +438,8 @@ def update(
         return _Pass(optimal, A, inverse, weights, used, distance, log_det, nis)
 
     # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
-    k, zero = jnp.zeros((), jnp.int32), jnp.zeros(d, dtype)
-    last = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(iterate, k, zero))
+    zero, matrix, each = (jnp.zeros(shape, dtype) for shape in ((), (len(support), len(support)), len(mask)))
+    last = _Pass(jnp.zeros(d, dtype), matrix, _Inverse(matrix, zero), valid, mask, each, zero, zero)
     last = jax.lax.fori_loop(0, passes, lambda k, found: iterate(k, found.optimal), last)
     optimal, A, inverse, weights, used, distance, noise_log_det, nis = last
     covariance = prior.posterior(A, inverse)
