@@ -243,8 +243,14 @@ def matrix_from_euler(yaw_pitch_roll: Float[Array, "3"]) -> Float[Array, "3 3"]:
     With the camera's axes (x right, y down, z forward) pitch turns about x, yaw about y, roll about z.
     Singular at a yaw of a quarter turn. Source: Yu et al. 2006, section IV (the order is not stated there).
     """
-    yaw, pitch, roll = yaw_pitch_roll
-    return (SO3.from_z_radians(roll) @ SO3.from_y_radians(yaw) @ SO3.from_x_radians(pitch)).as_matrix()
+    # Written out: with its derivative a fifth of the kernels of three rotations multiplied.
+    (cy, cx, cz), (sy, sx, sz) = jnp.cos(yaw_pitch_roll), jnp.sin(yaw_pitch_roll)
+    rows = (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )
+    return jnp.stack([x for row in rows for x in row]).reshape(3, 3)
 
 
 def euler_from_matrix(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
