@@ -6,7 +6,7 @@ A process imports the library, starts the default filter from a base pair and gi
 the time is that from its start to its end. `cold` compiles everything, `cached` finds the programs that an earlier
 process kept (`jaxtri.compilation.keep_programs`, which the command line calls). Medians; the import alone beside them.
 
-Last answer (2 idle cores, JAX 0.10): import 1.4 s, cold 5.7 s (3 asked), cached 2.8 s (1.5 asked).
+Last answer (2 idle cores, JAX 0.10): import 1.4 s, cold 5.1 s (3 asked), cached 2.4 s (1.5 asked).
 """
 
 import os

@@ -15,12 +15,12 @@ of a frame: `gtsam_isam2` one incremental update, `gtsam_batch` one Levenberg-Ma
 wants that accuracy at every frame pays for every frame; `gtsam_batch_once` is the same divided by its frames.
 Factors are built outside the clock. A peer that is not installed is left out, with a notice.
 
-Last answer (2 idle cores, JAX 0.10; times ours at N = 30 / 100 / 300): dynamax 1.9 / 8.5 / 43, kalman-py
-2.2 / 10 / 63, cuthbert 2.5 / 14 / 109, filterpy 4.9 / 21 / 139, numpy_paper 3.2 / 25 / 193, numpy_information
-2.2 / 2.7 / 3.2, and 8.8 at 10,000; answers apart by 4e-9. Asked at 300: 75 times every library (two reach it), 250
-and 4.5 for NumPy, and at 30 2.5 times dynamax: missed, as a frame of ours costs 148 us for few points, 218 for 300.
-GTSAM at 300: iSAM2 (its default settings) 357 ms a frame, 415 times (5,000 asked), batch 1.8 s, 2,120 times for a
-batch a frame (500 asked), 23 times for one in all; rotation .0052 degrees ours, .066 iSAM2, .0032 batch.
+Last answer (2 idle cores, JAX 0.10; times ours at N = 30 / 100 / 300): dynamax 1.6 / 12 / 60, kalman-py 2.2 / 13 /
+88, cuthbert 2.0 / 22 / 147, filterpy 5.9 / 28 / 197, numpy_paper 6.3 / 33 / 280, numpy_information 4.1 / 5.6 / 4.6,
+and 9.1 at 10,000; answers apart by 4e-9. Asked at 300: 75 times every library (all but dynamax), 250 and 4.5 for
+NumPy (reached), and at 30 2.5 times dynamax: missed, as a frame of ours costs 101 us for few points, 146 for 300.
+GTSAM at 300: iSAM2 (its default settings) 375 ms a frame, 463 times (5,000 asked), batch 2.0 s, 2,490 times for a
+batch a frame (500 asked), 27 times for one in all; rotation .0052 degrees ours, .066 iSAM2, .0032 batch.
 """
 
 import time

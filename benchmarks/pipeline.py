@@ -7,11 +7,12 @@ compiled before. `demo` is the command line's, at 640 x 480; in `restart` the ca
 that it is lost and starts anew. `p99` and `max` are of the time between two poses, `filter` the share of it in which
 one is filtered; optical flow runs beside, in a thread of its own.
 
-Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 82 frames a second (p99 23 ms, slowest 81), blinded 106 (the grey
-frames cost little), 640 x 480 video 57 to 89, 752 x 480 79, KITTI 44; the slowest frames, 55 to 132 ms, are those of a
-start or restart (relative pose by maximum likelihood). 120 frames a second, 30 ms and 5 % are asked. Optical flow takes
-7 to 14 ms a frame at 640 x 480, the filter 6 to 10 beside it: together they want more than two cores, alone the filter
-takes 4. One after the other, and looking back through all levels of the pyramid, the demo was at 52.
+Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 84 frames a second (p99 23 ms, slowest 29), blinded 111 (17,
+25; the grey frames cost little), 640 x 480 video 58 to 94, 752 x 480 71, KITTI 40; in another run 91, 96, 42 to 83,
+77, 44. The slowest frame of a video at 640 x 480 takes 22 to 24 ms, but 78 and 83 on Tsukuba and the rotation. 120
+frames a second, 30 ms and 5 % are asked. Optical flow takes 8 to 13 ms a frame at 640 x 480, the filter 2 to 9 beside
+it: together they want more than two cores, alone the filter takes 3 to 4. With a start that is waited for the slowest
+frames took 55 to 132 ms.
 """
 
 import tempfile
