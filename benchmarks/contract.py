@@ -68,12 +68,12 @@ def in_turns(runs: Mapping[str, Callable[[], object]], rounds: int) -> dict[str,
 def plot_growth(curves: Mapping[str, Mapping[int, float]], label: str, path: Path) -> None:
     """Cost against the number of points, on logarithmic axes; `label` is that of the cost."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure, axis = plt.subplots(figsize=(6.5, 4.5), layout="constrained")
+    figure, axis = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
     for name, x in curves.items():
         axis.loglog(list(x), list(x.values()), "o-", label=name)
     axis.set(xlabel="points N", ylabel=label)
     axis.grid(alpha=0.3, which="both")
-    axis.legend(loc="upper left")
+    figure.legend(loc="outside right upper")
     with atomic_path(path) as written:
         figure.savefig(written, dpi=120)
     plt.close(figure)
