@@ -297,8 +297,15 @@ class Odometry:
         if tried == first.index and flow < 1.1 * before:
             return
         self._tried = (first.index, flow)
+        # What a `with` has set in JAX holds for the thread that says so alone.
+        x64, device = jax.enable_x64.value, jax.default_device.value
+
+        def begin() -> _Begun | str:
+            with jax.enable_x64(x64), jax.default_device(device):
+                return self._begin(self._waiting, self._passed)
+
         pool = ThreadPoolExecutor(1, thread_name_prefix="start")
-        self._search = pool.submit(self._begin, self._waiting, self._passed)
+        self._search = pool.submit(begin)
         pool.shutdown(wait=False)
 
     def _settle(self, search: Future[_Begun | str]) -> None:

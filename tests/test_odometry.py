@@ -190,6 +190,22 @@ def test_an_error_while_a_start_is_worked_out_is_raised(monkeypatch):
         follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
 
 
+@pytest.mark.filterwarnings("ignore:Explicitly requested dtype")
+def test_a_start_is_worked_out_as_its_caller_has_set_jax(monkeypatch):
+    seen = []
+
+    def find(*_):
+        seen.append((jax.enable_x64.value, jax.default_device.value))
+        return bases.Start(None, "not now")
+
+    monkeypatch.setattr("jaxtri.odometry.find", find)
+    tracks, device = sideways(20), jax.devices("cpu")[0]
+    with jax.enable_x64(False), jax.default_device(device):
+        follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
+    assert seen
+    assert set(seen) == {(False, device)}
+
+
 def test_frames_that_make_no_sense_are_coasted_over():
     tracks = sideways(40)
     pixels = tracks.pixels.copy()
