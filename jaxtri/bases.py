@@ -38,7 +38,7 @@ class StartSettings:
     common: float = 0.15  # share of the tracks that must survive; below it a later first frame is taken
     restart: float = 0.35  # share of a pair's tracks below which a segment ends (inherit, paper)
     overlap: int = 1  # frames that two segments share (paper)
-    lag: int = 16  # frames that come while a start is worked out beside them; it changes no pose, only when it is known
+    lag: int = 16  # frames that come while a start is worked out beside them; its poses are known after as many
     eight_point: bool = False  # the 8-point algorithm with RANSAC, as in the paper
 
     @classmethod

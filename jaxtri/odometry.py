@@ -73,7 +73,11 @@ class _Begun(NamedTuple):
 
 CATCH_UP = 2  # frames taken in for each that comes, where some came while a start was worked out
 _normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
-_matrix = jax.jit(SE3.as_matrix)
+_as_matrix = jax.jit(SE3.as_matrix)
+
+
+def _matrix(pose: SE3) -> np.ndarray:
+    return np.asarray(_as_matrix(pose), np.float64)
 
 
 @dataclass
@@ -86,7 +90,7 @@ class Odometry:
     was, and `scale_unknown_from` names the frame from which this is a guess.
 
     A start takes as long as many frames, so it is worked out by a thread while the next `StartSettings.lag`
-    frames queue up; what comes out does not depend on that. `finish` takes in what is queued.
+    frames queue up; what comes out of given tracks does not depend on that. `finish` takes in what is queued.
     """
 
     camera: Camera
@@ -144,26 +148,25 @@ class Odometry:
 
     def _take_in(self, newest: float, most: float) -> np.ndarray:
         """Up to `most` queued frames, in order, but none before a start is there; the numbers of tracks to give up."""
-        outliers = [np.zeros(0, np.int64)]
+        outliers: list[np.ndarray] = []
         while True:
             if self._search is not None:
                 if newest < self._waiting[-1].index + self._start.lag:
                     break
                 self._settle(self._search)
-            if not self._queue or len(outliers) > most:
+            if not self._queue or len(outliers) >= most:
                 break
             frame = self._queue.popleft()
             if self._follower is None:
-                self.poses[frame.index].status = Status.LOST if self.segments else Status.INITIALISING
                 self._waiting.append(frame)
                 self._try_start()
                 continue
             report = self._follower.follow(frame, self._dt(frame.index))
-            self.poses[frame.index] = _pose(frame, report.pose, report)
+            self.poses[frame.index] = _pose(frame, report)
             outliers.append(frame.ids[np.asarray(report.drop)])
             if self.poses[frame.index].status is Status.LOST:
                 self._lose(frame)
-        return np.concatenate(outliers)
+        return np.concatenate(outliers or [np.zeros(0, np.int64)])
 
     @property
     def status(self) -> Status:
@@ -302,7 +305,7 @@ class Odometry:
 
         def begin() -> _Begun | str:
             with jax.enable_x64(x64), jax.default_device(device):
-                return self._begin(self._waiting, self._passed)
+                return self._begin()
 
         pool = ThreadPoolExecutor(1, thread_name_prefix="start")
         self._search = pool.submit(begin)
@@ -326,11 +329,12 @@ class Odometry:
         self.segments += 1
         self._waiting, self._passed = [], []
 
-    def _begin(self, frames: list[Frame], passed: list[Frame]) -> _Begun | str:
-        """The filter from a base pair, and the frames between and before filled in; or why it has to wait.
+    def _begin(self) -> _Begun | str:
+        """The filter from a base pair of waiting frames, those between and before filled in; or why it has to wait.
 
         Other frames are queued meanwhile, so it only reads, and only what they do not change.
         """
+        frames = self._waiting
         searched = find(self._settings, self._start, frames)
         if searched.found is None:
             return searched.reason
@@ -344,9 +348,9 @@ class Odometry:
             state, _ = fill(self._settings, [first, last], pose, world, [1.0])
             pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
         state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
-        poses = {first.index: _pose(first, world, None, Status.RESTARTED if again else Status.TRACKING)}
-        for frame, report in [*reports, *self._backwards(first, passed, state, world)]:
-            poses[frame.index] = _pose(frame, report.pose, report)
+        status = Status.RESTARTED if again else Status.TRACKING
+        poses = {first.index: FramePose(first.time, status, _matrix(world), np.zeros((6, 6)))}
+        poses |= {f.index: _pose(f, report) for f, report in [*reports, *self._backwards(first, state, world)]}
         if self.base is Base.TRACKS:
             follower: Follower = TrackPairs(self._settings, state, last, first.common(last))
         else:
@@ -354,13 +358,13 @@ class Odometry:
         pair = Restart(first.index, last.index, first.index, searched.found.pose, searched.found.inside)
         return _Begun(pair, follower, poses)
 
-    def _backwards(self, first: Frame, passed: list[Frame], state, world: SE3) -> Iterator[tuple[Frame, Report]]:
+    def _backwards(self, first: Frame, state, world: SE3) -> Iterator[tuple[Frame, Report]]:
         """Frames that waited before the first base frame, newest first, as far as its tracks reach."""
         mean = eqx.tree_at(
             lambda m: (m.pose, m.twist), state.belief.mean, (world, jnp.zeros_like(state.belief.mean.twist))
         )
         state = state._replace(belief=eqx.tree_at(lambda b: b.mean, state.belief, mean))
-        for frame in reversed(passed):
+        for frame in reversed(self._passed):
             state, report = hold(self._settings, state, frame, first.common(frame), 1.0)
             if int(report.status) != Status.TRACKING:
                 return
@@ -373,6 +377,8 @@ class Odometry:
         if self._recording:
             del self._tracks[frame.index + 1 :]
         self._recording = False
+        for queued in self._queue:
+            self.poses[queued.index].status = Status.LOST
         self._depth = self._follower.depth
         for points in (self._follower.ended(), self._follower.present()):
             _keep(self._points, points)
@@ -381,13 +387,12 @@ class Odometry:
         self.reason = "too few points agreed with any motion"
 
 
-def _pose(frame: Frame, pose: SE3, report: Report | None, status: Status | None = None) -> FramePose:
-    found = FramePose(frame.time, status or Status.TRACKING, np.asarray(_matrix(pose), np.float64), np.zeros((6, 6)))
-    if report is not None:
-        found.covariance = np.asarray(report.covariance, np.float64)
-        found.status = Status(int(report.status))
-        found.used, found.nis = int(report.diagnostics.used), float(report.diagnostics.nis)
-    return found
+def _pose(frame: Frame, report: Report) -> FramePose:
+    said = report.diagnostics
+    covariance = np.asarray(report.covariance, np.float64)
+    return FramePose(
+        frame.time, Status(int(report.status)), _matrix(report.pose), covariance, int(said.used), float(said.nis)
+    )
 
 
 def _keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> None:

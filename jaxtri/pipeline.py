@@ -104,7 +104,6 @@ def track(
                 bar.update()
                 milliseconds.append(1e3 * (time.perf_counter() - clock))
                 clock = time.perf_counter()
-        tracker.finish()
     except KeyboardInterrupt:
         interrupted = True
     finally:

@@ -172,11 +172,12 @@ def hypotheses(
     wanted = np.isin(np.arange(HYPOTHESES), _distinct(rough, worst=4.0))
     R = rough.pose.rotation.as_matrix()
     fine = _refine(R, rough.pose.translation, first, second, rough.inside, wanted, common, sigma)
+    fine = jax.tree.map(np.asarray, fine)  # to take it apart there: here each index would be a program of its own
     return [
         Hypothesis(
-            jax.tree.map(lambda x, k=k: x[k], fine.pose),
+            jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), fine.pose),
             float(fine.cost[k]),
-            np.asarray(fine.inside[k]),
+            fine.inside[k],
             float(np.rad2deg(fine.parallax[k])),
         )
         for k in _distinct(fine)
