@@ -3,7 +3,7 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/gradient_cost.py
 
 The paper's experiment, 99 frames of 300 points; the gradient with respect to sigma and both accelerations. `reverse`
-and `forward` are modes of differentiation; `block` is the frames between two kept beliefs (`jaxtri.scan`). Times are
+and `forward` are modes of differentiation; `block` is the frames between two kept beliefs (`filters.scan`). Times are
 medians over interleaved runs, memory is what the compiler sets aside beside arguments and results.
 
 Last answer (2 idle cores, JAX 0.10), over the run, MB and compilation of the gradient:
@@ -30,7 +30,7 @@ from jaxtyping import Array
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import ekf, schmidt  # noqa: E402
+from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, consistent_start, start  # noqa: E402
 from jaxtri.synthetic import paper_experiment  # noqa: E402
 from jaxtri.two_view import TwoView, refine  # noqa: E402

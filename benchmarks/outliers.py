@@ -38,7 +38,7 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import ekf, schmidt  # noqa: E402
+from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.io import atomic_path  # noqa: E402
 from jaxtri.models import base_frames  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, consistent_start, informative, start  # noqa: E402
@@ -162,7 +162,7 @@ def _bases(sigma: Array, motion: tuple[Array, Array], view: TwoView, u: Array, i
     frames = np.arange(2, len(u))
     base, slot = jnp.array([f in SLOTS for f in frames]), jnp.array([SLOTS.get(int(f), 0) for f in frames])
 
-    def step(belief: schmidt.Belief, frame: tuple[Array, Array, Array]) -> tuple[schmidt.Belief, Any]:
+    def step(belief: schmidt.ConsiderBelief, frame: tuple[Array, Array, Array]) -> tuple[schmidt.ConsiderBelief, Any]:
         z, base, slot = frame
         mask = inside & base_frames.informative(model, belief, SMALLEST_SNR)
         belief, said = base_frames.step(model, belief, z, mask, base, slot, passes=PASSES, robust=ekf.Robust())

@@ -21,7 +21,7 @@ from jaxlie import SE3, SO3
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from jaxtri import ekf, schmidt
+from jaxtri.filters import ekf, schmidt
 from jaxtri.geometry.epipolar import homogeneous
 from jaxtri.geometry.trifocal import project
 from jaxtri.models import base_frames, two_step
@@ -172,7 +172,7 @@ def _trifocal(e: Experiment, view: TwoView, method: str, frames: float) -> Filte
     moved: Kinematics = belief.mean.motion
     bank = depth.step(bank, moved.pose, second, everything, moved.pose_covariance(belief.covariance))
 
-    def covariance(belief: ekf.Belief | schmidt.Belief) -> Array:
+    def covariance(belief: ekf.Belief | schmidt.ConsiderBelief) -> Array:
         return belief.covariance if isinstance(belief, ekf.Belief) else schmidt.total(model, belief, pairs).covariance
 
     def step(carry: tuple[Any, Bank | None], z: Array) -> tuple[tuple[Any, Bank | None], ekf.Diagnostics]:
@@ -201,7 +201,9 @@ def _base_frames(e: Experiment, view: TwoView, k: int, frames: float) -> Filter:
     everything = jnp.ones(e.observed.shape[1], bool)
     belief = base_frames.start(view, e.observed[0], e.observed[1], everything, e.sigma, k, frames=frames, **SD)
 
-    def step(carry: tuple[schmidt.Belief, Array], z: Array) -> tuple[tuple[schmidt.Belief, Array], ekf.Diagnostics]:
+    def step(
+        carry: tuple[schmidt.ConsiderBelief, Array], z: Array
+    ) -> tuple[tuple[schmidt.ConsiderBelief, Array], ekf.Diagnostics]:
         belief, t = carry
         found = jnp.asarray(BASES) == t
         base, slot = jnp.any(found) & (k > 2), 1 + jnp.argmax(found) % max(k - 2, 1)
@@ -209,7 +211,7 @@ def _base_frames(e: Experiment, view: TwoView, k: int, frames: float) -> Filter:
         belief, said = base_frames.step(model, belief, z, mask, base, slot, passes=DEFAULT.passes)
         return (belief, t + 1), said
 
-    def read(carry: tuple[schmidt.Belief, Array], nis: Array) -> Estimate:
+    def read(carry: tuple[schmidt.ConsiderBelief, Array], nis: Array) -> Estimate:
         belief = carry[0]
         motion, p = belief.mean.motion, belief.mean.points
         P = schmidt.total(model, belief, None).covariance

@@ -41,7 +41,7 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import ekf  # noqa: E402
+from jaxtri.filters import ekf  # noqa: E402
 from jaxtri.geometry.epipolar import homogeneous, perpendicular_line  # noqa: E402
 from jaxtri.geometry.pose import rotation_matrix  # noqa: E402
 from jaxtri.geometry.trifocal import transfer  # noqa: E402

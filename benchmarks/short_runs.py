@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", "--float32" not in sys.argv)
 
-from jaxtri import ekf, schmidt  # noqa: E402
+from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.geometry.epipolar import safe_norm  # noqa: E402
 from jaxtri.geometry.trifocal import project  # noqa: E402
 from jaxtri.io import atomic_path  # noqa: E402
@@ -156,7 +156,9 @@ def outputs(run: Run, view: TwoView, mode: str, weights: ekf.Robust | None) -> t
         model = base_frames.BaseFrames(run.sigma, linear, angular)
         begun = base_frames.start(view, first, second, both, run.sigma, K, **sd)
 
-        def step(belief: schmidt.Belief, frame: tuple[Array, Array, Array, Array]) -> tuple[schmidt.Belief, Any]:
+        def step(
+            belief: schmidt.ConsiderBelief, frame: tuple[Array, Array, Array, Array]
+        ) -> tuple[schmidt.ConsiderBelief, Any]:
             z, seen, base, slot = frame
             sure = base_frames.informative(model, belief, SMALLEST_SNR)
             belief, said = base_frames.step(model, belief, z, seen & sure, base, slot, passes=passes, robust=weights)

@@ -38,10 +38,10 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import ekf  # noqa: E402
+from jaxtri.filters import ekf  # noqa: E402
+from jaxtri.filters.scan import batch  # noqa: E402
 from jaxtri.geometry.pose import rotation_matrix  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, TrifocalState, start  # noqa: E402
-from jaxtri.scan import batch  # noqa: E402
 
 SIZES = (30, 100, 300, 1000, 3000, 10000)
 FRAMES = 91

@@ -54,7 +54,8 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import ekf, replay, schmidt, tuning  # noqa: E402
+from jaxtri import replay, tuning  # noqa: E402
+from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
 from jaxtri.io import atomic_path, read_camera, read_tum  # noqa: E402
 from jaxtri.models import structure_and_motion, trifocal  # noqa: E402

@@ -14,12 +14,9 @@ Conventions, written here once:
 - The dtype follows the inputs; nothing here touches `jax.config`.
 """
 
-from jaxtri import ekf as ekf
-from jaxtri import schmidt as schmidt
 from jaxtri import segments as segments
 from jaxtri import tracker as tracker
 from jaxtri.bound import filtering_bound, smoothing_bound
-from jaxtri.ekf import Belief, Diagnostics, Robust
 from jaxtri.errors import (
     CameraError,
     InitialisationError,
@@ -31,6 +28,11 @@ from jaxtri.errors import (
     TruncatedVideoWarning,
     VideoError,
 )
+from jaxtri.filters import ekf as ekf
+from jaxtri.filters import schmidt as schmidt
+from jaxtri.filters.ekf import Diagnostics, Robust
+from jaxtri.filters.model import Belief
+from jaxtri.filters.scan import batch
 from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
 from jaxtri.models.base_frames import BaseFrames, BaseFramesState
 from jaxtri.models.base_pairs import BasePairs, BasePoint
@@ -39,7 +41,6 @@ from jaxtri.models.motion import Kinematics, Twist
 from jaxtri.models.structure_and_motion import StructureAndMotion
 from jaxtri.models.trifocal import Trifocal, TrifocalState
 from jaxtri.models.two_step import TwoStep
-from jaxtri.scan import batch
 from jaxtri.tracker import Settings, Status
 from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
 from jaxtri.two_view import TwoView, refine

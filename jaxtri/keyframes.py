@@ -65,7 +65,7 @@ def carry(
 
     P is the posterior `covariance`; `information` A = sum w H' D^-1 H and `coupling` C = sum w H' D^-1 J are what
     the update's measurements say of the pose, the first six components of the error, and of the pose together with
-    the keyframes (`jaxtri.moments`).
+    the keyframes (`jaxtri.filters.projective`).
     """
     moved = transition @ sensitivity
     return moved - covariance[:, :6] @ (information @ moved[:6] + coupling)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri import ekf
+from jaxtri.filters import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
 from jaxtri.geometry.pose import adjoint, multiply, relative, shear
 from jaxtri.models.depth import Bank

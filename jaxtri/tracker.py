@@ -17,7 +17,10 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri import ekf, moments
+from jaxtri.filters import ekf, projective
+from jaxtri.filters.masks import replace_masked, stand_in
+from jaxtri.filters.model import transition
+from jaxtri.filters.scan import checkpointed
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 from jaxtri.geometry.pose import multiply, relative
@@ -26,7 +29,6 @@ from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_poin
 from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Twist
 from jaxtri.models.point_noise import PointNoise
-from jaxtri.scan import checkpointed
 
 
 class Status(IntEnum):
@@ -273,7 +275,7 @@ def step(
     model = _model(settings, state.depth)
     predicted = ekf.predict(model, state.belief, dt)
     mask, scale = tracks.usable, noise_scale(settings, quality)
-    items = moments.prepare(model, ekf.stand_in(mask, tracks.base))
+    items = projective.prepare(model, stand_in(mask, tracks.base))
     updated, diagnostics = ekf.update(
         model, predicted, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
     )
@@ -283,7 +285,7 @@ def step(
     weights = jnp.where(ok, diagnostics.weights, 0.0)
     sensitivity = carry(
         state.sensitivity,
-        ekf.transition(model, state.belief.mean, dt),
+        transition(model, state.belief.mean, dt),
         belief.covariance,
         *_owed(model, belief.mean, items, tracks, weights, scale, state.sensitivity.shape[1] // 6),
     )
@@ -318,7 +320,7 @@ def step(
 def _owed(
     model: BasePairs,
     mean: Twist,
-    items: moments.Moments,
+    items: projective.Moments,
     tracks: Tracks,
     weights: Float[Array, " n"],
     scale: Float[Array, " n"] | None,
@@ -326,9 +328,9 @@ def _owed(
 ) -> tuple[Float[Array, "6 6"], Float[Array, "6 s"]]:
     """What the measurements of an update say of the pose, and of the pose together with k keyframes."""
     mask = weights > 0
-    scale = ekf.replace_masked(mask, scale, 1.0)
+    scale = replace_masked(mask, scale, 1.0)
     zero, unmeasured = jnp.zeros(12, weights.dtype), jnp.zeros_like(tracks.first)
-    said = moments.linearise(model, mean, zero, items, unmeasured, mask, scale)
+    said = projective.linearise(model, mean, zero, items, unmeasured, mask, scale)
     levers = jnp.where(mask[:, None, None], tracks.lever, 0.0)
     A, _ = said.normal_equations(weights)
     first, second = (said.coupling(weights, levers[..., 6 * j : 6 * j + 6], tracks.slots[:, j], k) for j in (0, 1))
@@ -355,7 +357,7 @@ def filter(
 ) -> tuple[State, Report]:
     """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan.
 
-    A reverse gradient keeps one state a frame, or one in every `block` frames: `jaxtri.scan`.
+    A reverse gradient keeps one state a frame, or one in every `block` frames: `jaxtri.filters.scan`.
     """
     if dt is None:
         dt = jnp.ones(observed.shape[0], observed.dtype)

@@ -20,8 +20,9 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
-from jaxtri.ekf import Diagnostics, stand_in
 from jaxtri.errors import InputError
+from jaxtri.filters.diagnostics import Diagnostics
+from jaxtri.filters.masks import stand_in
 from jaxtri.geometry.trifocal import project
 from jaxtri.trajectory import nees
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxlie import SO3
 
-from jaxtri import ekf, schmidt
 from jaxtri.bound import filtering_bound
+from jaxtri.filters import ekf, schmidt
 from jaxtri.geometry.pose import retract, shear
 from jaxtri.models import base_frames, trifocal
 from jaxtri.models.base_frames import BaseFrames

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jaxlie import SO3
 
-from jaxtri import ekf
 from jaxtri.bound import filtering_bound
+from jaxtri.filters import ekf
 from jaxtri.geometry.pose import compose, log_pose, matrix_from_euler, relative
 from jaxtri.models import structure_and_motion as sam
 from jaxtri.models import two_step

@@ -18,7 +18,9 @@ from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxtri import ekf, schmidt, tracker
+from jaxtri import tracker
+from jaxtri.filters import ekf, schmidt
+from jaxtri.filters.linalg import regression
 from jaxtri.geometry.pose import compose, shear
 from jaxtri.models import base_frames, trifocal, two_step
 from jaxtri.models import structure_and_motion as sam
@@ -357,7 +359,7 @@ def test_regression_gives_no_weight_to_what_is_known():
     n /= np.linalg.norm(n)
     A -= np.outer(n, n @ A)
     P = jnp.asarray(A @ A.T)
-    G = ekf.regression(P, P @ F.T)
+    G = regression(P, P @ F.T)
     sd = np.sqrt(np.diagonal(P))
     assert np.abs(G * sd @ (n * sd)).max() < 1e-6 * np.abs(G * sd).max()
     np.testing.assert_allclose(G @ A, F @ A, atol=1e-9 * np.abs(F @ A).max())

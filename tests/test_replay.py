@@ -9,13 +9,13 @@ from tracks import sideways
 
 from jaxtri import replay
 from jaxtri.bases import Base, StartSettings
-from jaxtri.ekf import Diagnostics
 from jaxtri.errors import InitialisationError, InputError
+from jaxtri.filters.diagnostics import Diagnostics
+from jaxtri.filters.scan import checkpointed
 from jaxtri.geometry.camera import BrownConrady, Camera
 from jaxtri.models.point_noise import PointNoise
 from jaxtri.odometry import Odometry
 from jaxtri.pipeline import follow_tracks
-from jaxtri.scan import checkpointed
 from jaxtri.tracker import Report, Settings
 
 TRACKS = sideways(16, seed=1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
-from jaxtri import ekf
+from jaxtri.filters import ekf
 from jaxtri.geometry.pose import euler_from_matrix, matrix_from_euler, rotation_matrix
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, twist_noise
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start

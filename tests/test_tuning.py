@@ -8,8 +8,9 @@ from jaxlie import SE3
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
-from jaxtri import ekf, tuning
+from jaxtri import tuning
 from jaxtri.errors import InputError
+from jaxtri.filters import ekf
 from jaxtri.tuning import Parameter
 
 

@@ -22,12 +22,13 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri import schmidt
-from jaxtri.ekf import Diagnostics, Robust, regression, unless_overflown
+from jaxtri.filters import schmidt
+from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
+from jaxtri.filters.linalg import regression
+from jaxtri.filters.schmidt import ConsiderBelief, Measured
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.geometry.pose import local, retract, shear
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, from_two_view, twist_noise
-from jaxtri.schmidt import Belief, Measured
 from jaxtri.two_view import TwoView, sensitivity
 
 
@@ -127,7 +128,7 @@ def start(
     frames: Float[Array, ""] | float = 1.0,
     velocity_sd: Float[Array, ""] | float,
     angular_velocity_sd: Float[Array, ""] | float,
-) -> Belief[BaseFramesState]:
+) -> ConsiderBelief[BaseFramesState]:
     """The belief at the second of `k` base frames, `frames` after the first, from a two-view estimate.
 
     `mask` marks the pairs that it was made from. The points are those of the transfer (Yu et al. 2006, eqs 7-9).
@@ -163,11 +164,11 @@ def start(
     by_points = jnp.einsum("dnp,niq,nqp->dni", S, jnp.linalg.inv(Q), M)
     rest = (S - jnp.einsum("dni,nip->dnp", by_points, M)).reshape(12 + b, -1)
     own = jnp.diag(jnp.pad(variance, (0, b))) + jnp.square(sigma) * rest @ rest.T
-    return Belief(BaseFramesState(motion, bases, points), own, by_points)
+    return ConsiderBelief(BaseFramesState(motion, bases, points), own, by_points)
 
 
 def informative(
-    model: BaseFrames, belief: Belief[BaseFramesState], smallest: Float[Array, ""] | float
+    model: BaseFrames, belief: ConsiderBelief[BaseFramesState], smallest: Float[Array, ""] | float
 ) -> Bool[Array, " n"]:
     """Points whose inverse depth is at least `smallest` times its standard deviation: others are not to be used.
 
@@ -177,7 +178,9 @@ def informative(
     return p.point[:, 3] > smallest * model.sigma * jnp.sqrt(p.noise[:, 2, 2])
 
 
-def release(model: BaseFrames, belief: Belief[BaseFramesState], slot: Int[Array, ""]) -> Belief[BaseFramesState]:
+def release(
+    model: BaseFrames, belief: ConsiderBelief[BaseFramesState], slot: Int[Array, ""]
+) -> ConsiderBelief[BaseFramesState]:
     """The belief without the base frame in `slot` (0 to K - 2), which then holds nothing.
 
     Its error is written as a linear function of those of the other base frames; the remainder becomes an error
@@ -202,19 +205,23 @@ def release(model: BaseFrames, belief: Belief[BaseFramesState], slot: Int[Array,
     own = belief.own + schmidt.owed(belief.sensitivity, lost)
     kept = jnp.concatenate([jnp.ones(12, dtype), others])
     mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
-    return Belief(
+    return ConsiderBelief(
         mean, own * jnp.outer(kept, kept), jnp.einsum("dnp,npq->dnq", belief.sensitivity, T) * kept[:, None, None]
     )
 
 
-def forget(model: BaseFrames, belief: Belief[BaseFramesState], gone: Bool[Array, " n"]) -> Belief[BaseFramesState]:
+def forget(
+    model: BaseFrames, belief: ConsiderBelief[BaseFramesState], gone: Bool[Array, " n"]
+) -> ConsiderBelief[BaseFramesState]:
     """The belief without the points that are `gone`; what the state owes to their errors it keeps as its own."""
     S = jnp.where(gone[:, None], belief.sensitivity, 0.0)
     own = belief.own + schmidt.owed(S, model.item_noise(belief.mean, None))
-    return Belief(belief.mean, own, belief.sensitivity - S)
+    return ConsiderBelief(belief.mean, own, belief.sensitivity - S)
 
 
-def promote(belief: Belief[BaseFramesState], slot: Int[Array, ""], said: schmidt.ItemUpdate) -> Belief[BaseFramesState]:
+def promote(
+    belief: ConsiderBelief[BaseFramesState], slot: Int[Array, ""], said: schmidt.ItemUpdate
+) -> ConsiderBelief[BaseFramesState]:
     """The belief with the current pose as a base frame in `slot`, which must be empty.
 
     The points that the update has absorbed, as it `said`, are estimated anew.
@@ -242,18 +249,18 @@ def promote(belief: Belief[BaseFramesState], slot: Int[Array, ""], said: schmidt
     own = belief.own.at[rows].set(onto @ belief.own[:12])
     own = own.at[:, rows].set(own[:, :12] @ onto.T)
     S = belief.sensitivity.at[rows].set(jnp.einsum("ed,dnp->enp", onto, belief.sensitivity[:12]))
-    return Belief(BaseFramesState(mean.motion, bases, points), own, S)
+    return ConsiderBelief(BaseFramesState(mean.motion, bases, points), own, S)
 
 
 def begin(
     model: BaseFrames,
-    belief: Belief[BaseFramesState],
+    belief: ConsiderBelief[BaseFramesState],
     slot: Int[Array, ""],
     observed: Float[Array, "n 2"],
     fresh: Bool[Array, " n"],
     inverse_depth: Float[Array, ""],
     sd: Float[Array, ""],
-) -> Belief[BaseFramesState]:
+) -> ConsiderBelief[BaseFramesState]:
     """The belief with new points, first seen from the base frame in `slot`, the current pose.
 
     Their inverse depth is the given one, with the standard deviation `sd`: a narrow one, wrong for all points
@@ -282,12 +289,12 @@ def begin(
     )
     points = jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, p)
     mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
-    return Belief(mean, belief.own, jnp.where(fresh[:, None], 0.0, belief.sensitivity))
+    return ConsiderBelief(mean, belief.own, jnp.where(fresh[:, None], 0.0, belief.sensitivity))
 
 
 def step(
     model: BaseFrames,
-    belief: Belief[BaseFramesState],
+    belief: ConsiderBelief[BaseFramesState],
     observed: Float[Array, "n 2"],
     mask: Bool[Array, " n"],
     base: Bool[Array, ""],
@@ -296,7 +303,7 @@ def step(
     *,
     passes: int = 4,
     robust: Robust | None = None,
-) -> tuple[Belief[BaseFramesState], Diagnostics]:
+) -> tuple[ConsiderBelief[BaseFramesState], Diagnostics]:
     """One frame, which becomes the base frame in `slot` if `base` says so; what the slot held makes room.
 
     A branch, not a choice between two results: what is not taken costs nothing (but under vmap).
@@ -307,7 +314,7 @@ def step(
         model, ready, None, observed, mask, absorb=mask & base, passes=passes, robust=robust
     )
 
-    def kept(belief: Belief[BaseFramesState]) -> tuple[Belief[BaseFramesState], Diagnostics]:
+    def kept(belief: ConsiderBelief[BaseFramesState]) -> tuple[ConsiderBelief[BaseFramesState], Diagnostics]:
         return unless_overflown(predicted, promote(belief, slot, said), diagnostics)[:2]
 
     return jax.lax.cond(base, kept, lambda x: (x, diagnostics), updated)

@@ -82,7 +82,7 @@ class BasePairs(eqx.Module):
         """The transferred point, normalised."""
         return self._project(mean, item.point)
 
-    # The same measurements as a linear map and a division: `jaxtri.moments`.
+    # The same measurements as a linear map and a division: `jaxtri.filters.projective`.
 
     @property
     def support(self) -> np.ndarray:

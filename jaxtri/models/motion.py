@@ -9,7 +9,7 @@ import numpy as np
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Float
 
-from jaxtri.ekf import Belief
+from jaxtri.filters.model import Belief
 from jaxtri.geometry.pose import (
     compose,
     euler_from_matrix,

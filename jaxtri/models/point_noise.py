@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtri.ekf import number
+from jaxtri.checks import number
 
 # About the medians of the tracker's figures on video.
 _ERROR_PX = 0.1

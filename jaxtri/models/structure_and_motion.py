@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtri.ekf import Belief
+from jaxtri.filters.model import Belief
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous
 from jaxtri.geometry.pose import local, retract
 from jaxtri.models.depth import triangulate

@@ -15,13 +15,13 @@ import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
-from jaxtri import schmidt
-from jaxtri.ekf import Belief
+from jaxtri.filters import schmidt
+from jaxtri.filters.model import Belief
+from jaxtri.filters.schmidt import Measured
 from jaxtri.geometry.epipolar import homogeneous, inverse_depth, perpendicular_line, safe_norm
 from jaxtri.geometry.pose import difference, local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
 from jaxtri.models.motion import POSE_ROWS, Kinematics, MotionStart, acceleration_noise, from_two_view
-from jaxtri.schmidt import Measured
 from jaxtri.two_view import TwoView, sensitivity
 
 
@@ -122,7 +122,7 @@ class Trifocal(eqx.Module):
             noise = noise + J @ J.T
         return jnp.square(self.sigma) * noise
 
-    # The same measurements as a linear map and a division: `jaxtri.moments`.
+    # The same measurements as a linear map and a division: `jaxtri.filters.projective`.
 
     @property
     def support(self) -> np.ndarray:
@@ -193,7 +193,7 @@ def consistent_start(
     frames: Float[Array, ""] | float = 1.0,
     velocity_sd: Float[Array, ""] | float,
     angular_velocity_sd: Float[Array, ""] | float,
-) -> schmidt.Belief[TrifocalState]:
+) -> schmidt.ConsiderBelief[TrifocalState]:
     """As `start`, for `jaxtri.schmidt` with the pairs as items: the pose owes its error to their noise.
 
     `mask` marks the pairs that the two-view estimate was made from, all of its data.
@@ -201,7 +201,7 @@ def consistent_start(
     motion = from_two_view(two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd)
     state, E, own = _with_base(motion)
     S = sensitivity(two_view, pairs[:, :2], pairs[:, 2:], mask, sigma)
-    return schmidt.Belief(state, own, jnp.einsum("de,nep->dnp", E, S))
+    return schmidt.ConsiderBelief(state, own, jnp.einsum("de,nep->dnp", E, S))
 
 
 def _with_base(start: MotionStart) -> tuple[TrifocalState, Float[Array, "18 6"], Float[Array, "18 18"]]:

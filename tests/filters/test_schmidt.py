@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from jaxtri import ekf, schmidt
-from jaxtri.schmidt import Measured
+from jaxtri.filters import ekf, schmidt
+from jaxtri.filters.schmidt import Measured
 
 N, D, P = 7, 4, 3
 
@@ -45,7 +45,9 @@ def problem():
     root = rng.normal(size=(N, P, P))
     items = (rng.normal(size=(N, 2, D)), rng.normal(size=(N, 2, P)), root @ np.swapaxes(root, 1, 2))
     model = Linear(jnp.asarray(0.3), jnp.asarray(np.eye(D) + 0.1 * rng.normal(size=(D, D))))
-    belief = schmidt.Belief(jnp.asarray(rng.normal(size=D)), jnp.diag(jnp.arange(1.0, D + 1)), jnp.zeros((D, N, P)))
+    belief = schmidt.ConsiderBelief(
+        jnp.asarray(rng.normal(size=D)), jnp.diag(jnp.arange(1.0, D + 1)), jnp.zeros((D, N, P))
+    )
     observed, mask = rng.normal(size=(5, N, 2)), rng.random((5, N)) < 0.8
     return model, belief, jax.tree.map(jnp.asarray, items), jnp.asarray(observed), jnp.asarray(mask)
 

@@ -9,7 +9,8 @@ from jaxlie import SO3
 from jaxtyping import Array, Float
 from scipy.stats import multivariate_normal
 
-from jaxtri import ekf
+from jaxtri.filters import ekf
+from jaxtri.filters.model import transition
 from jaxtri.geometry import pose
 
 N = 24  # landmarks, the same number everywhere: one compilation for all tests
@@ -363,7 +364,7 @@ def test_prediction_equals_the_dense_one():
     np.testing.assert_allclose(local(model, mean, predicted.mean), 0, atol=1e-14)
     expected = F @ belief.covariance @ F.T + model.process_noise(mean, dt)
     np.testing.assert_allclose(predicted.covariance, expected, atol=1e-9)
-    np.testing.assert_allclose(jax.jit(ekf.transition)(model, belief.mean, dt), F, atol=1e-8)
+    np.testing.assert_allclose(jax.jit(transition)(model, belief.mean, dt), F, atol=1e-8)
 
 
 def test_an_update_that_overflows_is_not_taken():

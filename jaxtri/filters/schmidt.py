@@ -12,21 +12,21 @@ Where to linearise is sought for state and items together: derivatives taken at 
 have an error in common with the innovation, which m is part of, and it adds up to a drift of the scale.
 """
 
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxtri import ekf
-from jaxtri.ekf import Diagnostics, Robust
-from jaxtri.scan import checkpointed
+from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
+from jaxtri.filters.linalg import posterior_error, scales, whiten
+from jaxtri.filters.masks import replace_masked, safe_root, stand_in
+from jaxtri.filters.model import Belief, Dynamics, Mean, change_of_origin, transition
+from jaxtri.filters.scan import checkpointed
 
-Mean = TypeVar("Mean")
 
-
-class Belief(eqx.Module, Generic[Mean]):
+class ConsiderBelief(eqx.Module, Generic[Mean]):
     """A Gaussian on a manifold: the true state is `retract(mean, e)`, e ~ N(0, own) + sum_i sensitivity_i m_i."""
 
     mean: Mean
@@ -47,8 +47,8 @@ class Measured(NamedTuple):
 
 
 @runtime_checkable
-class Model(ekf.Dynamics[Mean], Protocol[Mean]):
-    """What this filter asks of its problem: as `jaxtri.ekf.Model`, but for the measurements, all at once."""
+class ConsiderModel(Dynamics[Mean], Protocol[Mean]):
+    """What this filter asks of its problem: as `jaxtri.filters.model.Model`, but for the measurements, all at once."""
 
     sigma: Float[Array, ""]  # of a component of a measurement
 
@@ -85,17 +85,19 @@ def _times(F: Float[Array, "e d"], x: Float[Array, "d n p"]) -> Float[Array, "e 
     return (F @ _rows(x)).reshape(-1, *x.shape[1:])
 
 
-def predict(model: Model[Mean], belief: Belief[Mean], dt: Float[Array, ""] | float = 1.0) -> Belief[Mean]:
+def predict(
+    model: ConsiderModel[Mean], belief: ConsiderBelief[Mean], dt: Float[Array, ""] | float = 1.0
+) -> ConsiderBelief[Mean]:
     """The belief one time step later."""
     dt = jnp.asarray(dt, belief.own.dtype)
-    F = ekf.transition(model, belief.mean, dt)
+    F = transition(model, belief.mean, dt)
     own = F @ belief.own @ F.T + model.process_noise(belief.mean, dt)
-    return Belief(model.predict(belief.mean, dt), own, _times(F, belief.sensitivity))
+    return ConsiderBelief(model.predict(belief.mean, dt), own, _times(F, belief.sensitivity))
 
 
-def total(model: Model[Mean], belief: Belief[Mean], items: PyTree[Array]) -> ekf.Belief[Mean]:
+def total(model: ConsiderModel[Mean], belief: ConsiderBelief[Mean], items: PyTree[Array]) -> Belief[Mean]:
     """The belief with the covariance of its whole error."""
-    return ekf.Belief(belief.mean, belief.covariance(model.item_noise(belief.mean, items)))
+    return Belief(belief.mean, belief.covariance(model.item_noise(belief.mean, items)))
 
 
 class _Pass(NamedTuple):
@@ -124,7 +126,7 @@ class _Pass(NamedTuple):
 
 
 def _linearise(
-    model: Model[Mean],
+    model: ConsiderModel[Mean],
     mean: Mean,
     items: PyTree,
     moved: Float[Array, "n p"],
@@ -132,19 +134,19 @@ def _linearise(
     observed: Float[Array, "n m"],
     present: Bool[Array, " n"],
 ) -> _Pass:
-    at = Measured(*ekf.replace_masked(present, model.measured(mean, items, moved), 0.0))
+    at = Measured(*replace_masked(present, model.measured(mean, items, moved), 0.0))
     predicted, _, spread = at
     innovation = observed - predicted + jnp.einsum("nmp,np->nm", spread, moved)
     D = jnp.einsum("nmp,npq,nkq->nmk", spread, item_noise, spread)
     D = D + jnp.square(model.sigma) * jnp.eye(observed.shape[1], dtype=D.dtype)
-    W, log_det = jax.vmap(ekf.whiten)(D)
+    W, log_det = jax.vmap(whiten)(D)
     distance = jnp.sum(jnp.einsum("nij,nj->ni", W, innovation) ** 2, axis=-1)
     return _Pass(at, item_noise, innovation, W, distance, log_det, D)
 
 
 def update(
-    model: Model[Mean],
-    belief: Belief[Mean],
+    model: ConsiderModel[Mean],
+    belief: ConsiderBelief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n m"],
     mask: Bool[Array, " n"],
@@ -152,7 +154,7 @@ def update(
     absorb: Bool[Array, " n"] | None = None,
     passes: int = 4,
     robust: Robust | None = None,
-) -> tuple[Belief[Mean], Diagnostics, ItemUpdate]:
+) -> tuple[ConsiderBelief[Mean], Diagnostics, ItemUpdate]:
     """The belief after the measurements of one frame; arguments as of `jaxtri.ekf.update`.
 
     `absorb` marks items whose measurement is about to enter their own estimate, as `ItemUpdate` says; those
@@ -166,7 +168,7 @@ def update(
     dtype, d = belief.own.dtype, belief.own.shape[0]
     present = mask if absorb is None else mask | absorb
     item_noise = model.item_noise(belief.mean, items)
-    items, observed = ekf.stand_in(present, items), ekf.replace_masked(present, observed, 0.0)
+    items, observed = stand_in(present, items), replace_masked(present, observed, 0.0)
     valid = mask.astype(dtype)
     still = jnp.zeros((mask.size, belief.sensitivity.shape[2]), dtype)
     P = belief.covariance(item_noise)
@@ -177,7 +179,7 @@ def update(
     def prior_at(mean: Mean) -> tuple[Array, Array]:
         """The change to the errors of another mean, and the prior's centre in these."""
         delta = model.local(belief.mean, mean)
-        reset = ekf.change_of_origin(model, belief.mean, delta, mean)
+        reset = change_of_origin(model, belief.mean, delta, mean)
         return reset, -reset @ delta
 
     def iterate(k: Array, carry: tuple[Mean, Array]) -> tuple[Mean, Array]:
@@ -185,8 +187,8 @@ def update(
         reset, centre = prior_at(mean)
         lin = _linearise(model, mean, items, moved, item_noise, observed, present)
         weights = weigh(lin, k)
-        H, v = lin.whitened(ekf.safe_root(weights))
-        e = centre + ekf.posterior_error(reset @ P @ reset.T, H.T @ H, H.T @ (v - H @ centre))
+        H, v = lin.whitened(safe_root(weights))
+        e = centre + posterior_error(reset @ P @ reset.T, H.T @ H, H.T @ (v - H @ centre))
         # An outlier says nothing of its item, which it might move to where the measurement is singular.
         believed = jnp.where(mask, weights, 1.0)[:, None]
         return model.retract(mean, e), believed * lin.item_update(e).moved
@@ -198,14 +200,14 @@ def update(
     if robust is not None:
         used = mask & (lin.distance < robust.gate.astype(dtype))
         weights = jnp.where(used, weights, 0.0)
-    root = ekf.safe_root(weights)
+    root = safe_root(weights)
     H, v = lin.whitened(root)
     v = v - H @ centre
     # S = D + G M G' with G = [H, spread C'], C = sensitivity noise, and M = [[P, I], [I, 0]]; O(d) by Woodbury.
     cross = jnp.einsum("nmp,npq,dnq->nmd", lin.at.spread, item_noise, belief.sensitivity)
     cross = jnp.einsum("n,nij,njd->nid", root, lin.whitener, cross).reshape(-1, d) @ reset.T
     prior = reset @ P @ reset.T
-    s = ekf.scales(prior)
+    s = scales(prior)
     G = jnp.concatenate([H * s, cross / s], axis=1)
     zero, eye = jnp.zeros((d, d), dtype), jnp.eye(d, dtype=dtype)
     inner = jnp.block([[zero, eye], [eye, -prior / jnp.outer(s, s)]]) + G.T @ G
@@ -218,7 +220,7 @@ def update(
 
     # The error now lives at the new mean, close by.
     final = model.retract(mean, e)
-    shift = ekf.change_of_origin(model, mean, e, final)
+    shift = change_of_origin(model, mean, e, final)
     gain = _times(shift, gain)
     keep = (shift - _rows(gain) @ lin.at.jacobian.reshape(-1, d)) @ reset
     sensitivity = _times(keep, belief.sensitivity)
@@ -234,29 +236,21 @@ def update(
         gain = jnp.where(absorbed[:, None], new, gain)
         pulled = jnp.where(absorbed[:, None], sensitivity, pulled)
     own = own + _rows(fresh) @ _rows(gain).T
-    posterior = Belief(final, (own + own.T) / 2, pulled)
+    posterior = ConsiderBelief(final, (own + own.T) / 2, pulled)
 
     log_det = jnp.linalg.slogdet(inner)[1] + jnp.sum(jnp.where(used, lin.log_det, 0.0))
-    constant = observed.shape[1] * jnp.log(2 * jnp.pi).astype(dtype) * jnp.sum(used).astype(dtype)
     left = lin.innovation - jnp.einsum("nmd,d->nm", lin.at.jacobian, e)
     distance = jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1)
     nis = nis + jnp.sum(jnp.where(used, 1 - weights, 0.0) * distance)  # every item that is used counts in full
-    diagnostics = Diagnostics(
-        log_likelihood=-(nis + log_det + constant) / 2,
-        nis=nis,
-        measured=jnp.sum(mask),
-        used=jnp.sum(used),
-        weights=weights,
-        distance=distance,
-    )
-    posterior, diagnostics, finite = ekf.unless_overflown(belief, posterior, diagnostics)
-    moved, gain = ekf.replace_masked(absorbed, (said.moved, said.gain), 0.0)
+    diagnostics = Diagnostics.of(nis, log_det, observed.shape[1], mask, used, weights=weights, distance=distance)
+    posterior, diagnostics, finite = unless_overflown(belief, posterior, diagnostics)
+    moved, gain = replace_masked(absorbed, (said.moved, said.gain), 0.0)
     return posterior, diagnostics, jax.tree.map(lambda x: jnp.where(finite, x, 0), ItemUpdate(moved, gain, lin.at))
 
 
 def step(
-    model: Model[Mean],
-    belief: Belief[Mean],
+    model: ConsiderModel[Mean],
+    belief: ConsiderBelief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n m"],
     mask: Bool[Array, " n"],
@@ -264,14 +258,14 @@ def step(
     *,
     passes: int = 4,
     robust: Robust | None = None,
-) -> tuple[Belief[Mean], Diagnostics]:
+) -> tuple[ConsiderBelief[Mean], Diagnostics]:
     """Predict to the next frame and update with it."""
     return update(model, predict(model, belief, dt), items, observed, mask, passes=passes, robust=robust)[:2]
 
 
 def filter(
-    model: Model[Mean],
-    belief: Belief[Mean],
+    model: ConsiderModel[Mean],
+    belief: ConsiderBelief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "t n m"],
     mask: Bool[Array, "t n"],
@@ -280,12 +274,12 @@ def filter(
     passes: int = 4,
     robust: Robust | None = None,
     block: int = 1,
-) -> tuple[ekf.Belief[Mean], Diagnostics]:
+) -> tuple[Belief[Mean], Diagnostics]:
     """Beliefs, with their whole covariance, and diagnostics of all frames: as `jaxtri.ekf.filter`."""
     if dt is None:
         dt = jnp.ones(observed.shape[0], belief.own.dtype)
 
-    def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
+    def body(carry: ConsiderBelief, frame: tuple) -> tuple[ConsiderBelief, tuple]:
         z, seen, elapsed = frame
         carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
         return carry, (total(model, carry, items), diagnostics)

@@ -7,7 +7,7 @@ import pytest
 from jaxlie import SO3
 
 import jaxtri
-from jaxtri import ekf
+from jaxtri.filters import ekf
 from jaxtri.models.trifocal import start
 from jaxtri.synthetic import paper_experiment
 from jaxtri.two_view import refine

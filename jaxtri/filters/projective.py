@@ -19,7 +19,7 @@ Mean = TypeVar("Mean")
 
 @runtime_checkable
 class Projective(Protocol[Mean]):
-    """What a model says beside `jaxtri.ekf.Model`, to be run by its moments; its measurements have two components."""
+    """What a model says beside `jaxtri.filters.model.Model` to be run by moments; it measures two components."""
 
     sigma: Float[Array, ""]  # of a component of a measurement
 

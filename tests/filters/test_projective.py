@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
-from jaxtri import ekf, moments
+from jaxtri.filters import ekf, projective
 from jaxtri.models.base_pairs import BasePairs, base_point
 from jaxtri.models.motion import Twist
 from jaxtri.models.trifocal import Trifocal, start
@@ -112,7 +112,7 @@ def test_items_are_prepared_once(experiment):
     model, belief, pairs = trifocal(*experiment, jnp.zeros(()), base_noise=True)
     mask = jnp.ones(POINTS, bool)
     prepared = ekf.prepare(model, pairs, mask)
-    assert isinstance(prepared, moments.Moments)
+    assert isinstance(prepared, projective.Moments)
     assert ekf.prepare(model, prepared, mask) is prepared
     assert ekf.prepare(Plain(model), pairs, mask) is pairs
     step = jax.jit(ekf.step)
@@ -128,8 +128,8 @@ def test_what_items_say_of_the_state_and_what_their_points_owe(experiment):
     levers = jax.random.normal(keys[0], (POINTS, 4, 6))
     weights = jax.random.uniform(keys[1], POINTS).at[3].set(0.0)
     groups = jax.random.randint(keys[2], POINTS, -1, 4)
-    prepared, none = moments.prepare(model, items), jnp.zeros((POINTS, 2))
-    said = moments.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None)
+    prepared, none = projective.prepare(model, items), jnp.zeros((POINTS, 2))
+    said = projective.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None)
 
     def one(item, lever):
         H = jax.jacfwd(lambda e: model.measure(model.retract(mean, e), item))(jnp.zeros(12))

@@ -1,0 +1,260 @@
+"""One extended Kalman filter for every model: iterated, masked, robust, O(N d^2 + d^3) a frame.
+
+A belief is a mean on a manifold and the covariance of its d-dimensional error. A model supplies the motion,
+the manifold and the measurement of one item; the update sums over N items and never forms the innovation
+covariance of all of them. Nothing here knows of cameras.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxtri.filters import projective
+from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
+from jaxtri.filters.linalg import Inverse, Prior, linearised, whiten
+from jaxtri.filters.masks import replace_masked, safe_root, stand_in
+from jaxtri.filters.model import Belief, Dynamics, Mean, Model, change_of_origin, predict
+from jaxtri.filters.projective import Moments, Projective
+from jaxtri.filters.scan import checkpointed
+from jaxtri.filters.smoother import smooth
+
+__all__ = [
+    "Belief",
+    "Diagnostics",
+    "Dynamics",
+    "Model",
+    "Robust",
+    "filter",
+    "predict",
+    "prepare",
+    "smooth",
+    "step",
+    "update",
+]
+
+
+@runtime_checkable
+class Evidence(Protocol):
+    """What a frame's measurements say at one state, in the s components of the error that they depend on."""
+
+    log_det: Float[Array, " n"]  # of the noise of each item, zero where masked
+
+    @property
+    def distance(self) -> Float[Array, " n"]:
+        """Squared Mahalanobis distance of the residual of each item, zero where masked."""
+        ...
+
+    def distance_after(self, step: Float[Array, " s"]) -> Float[Array, " n"]:
+        """The same after a step of the error, by the linearisation."""
+        ...
+
+    def normal_equations(self, weights: Float[Array, " n"]) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+        """A = sum w H' D^-1 H and sum w H' D^-1 r: all that the items say, in s numbers."""
+        ...
+
+
+class _Linearisation(eqx.Module):
+    """The plain form: a residual, a Jacobian and a noise for each item."""
+
+    residual: Float[Array, "n m"]
+    jacobian: Float[Array, "n m d"]
+    whitener: Float[Array, "n m m"]  # W with W' W = inverse noise
+    log_det: Float[Array, " n"]
+
+    @property
+    def distance(self) -> Array:
+        return jnp.sum(jnp.einsum("nij,nj->ni", self.whitener, self.residual) ** 2, axis=-1)
+
+    def distance_after(self, step: Array) -> Array:
+        left = self.residual - jnp.einsum("nmd,d->nm", self.jacobian, step)
+        return jnp.sum(jnp.einsum("nij,nj->ni", self.whitener, left) ** 2, axis=-1)
+
+    def normal_equations(self, weights: Array) -> tuple[Array, Array]:
+        root = safe_root(weights)[:, None]
+        H = jnp.einsum("nij,njd->nid", self.whitener, self.jacobian) * root[..., None]
+        r = jnp.einsum("nij,nj->ni", self.whitener, self.residual) * root
+        H = H.reshape(-1, H.shape[-1])
+        return H.T @ H, H.T @ r.reshape(-1)
+
+
+def _linearise(
+    model: Model, prior: Any, delta: Array, items: PyTree, observed: Array, mask: Array, scale: Array | None
+) -> _Linearisation:
+    """Residual, Jacobian with respect to the error of the *prior*, and noise, at `retract(prior, delta)`."""
+
+    def predicted(error: Array) -> Array:
+        mean = model.retract(prior, error)
+        return jax.vmap(lambda item: model.measure(mean, item))(items)
+
+    h, columns = linearised(predicted, delta)
+    mean = model.retract(prior, delta)
+    noise = jax.vmap(lambda item: model.noise(mean, item))(items)
+    if scale is not None:
+        noise = noise * jnp.square(scale)[:, None, None]
+    whitener, log_det = jax.vmap(whiten)(noise)
+    whitened = replace_masked(mask, (observed - h, columns, whitener, log_det), 0.0)
+    return _Linearisation(*whitened)
+
+
+def prepare(model: Model[Mean], items: PyTree[Array], mask: Bool[Array, " n"]) -> PyTree[Array]:
+    """The items in the form in which `update` sums over them, where the model has one (`jaxtri.filters.projective`).
+
+    Made once for all frames in which a part of those in `mask` is seen: a frame then costs less. What is prepared
+    already, and the items of other models, come back as they are.
+    """
+    if isinstance(items, Moments) or not isinstance(model, Projective):
+        return items
+    return projective.prepare(model, stand_in(mask, items))
+
+
+def _measuring(
+    model: Model[Mean], d: int, items: PyTree, mask: Bool[Array, " n"]
+) -> tuple[Callable[..., Evidence], np.ndarray]:
+    """A frame's evidence as a function of prior, error, observations, mask and noise scale; and the error's support."""
+    items = prepare(model, items, mask)
+    if isinstance(items, Moments):
+        assert isinstance(model, Projective)
+
+        def at(prior: Mean, delta: Array, observed: Array, mask: Array, scale: Array | None) -> Evidence:
+            return projective.linearise(model, prior, delta, items, observed, mask, scale)
+
+        return at, model.support
+    items = stand_in(mask, items)
+    return lambda prior, delta, *frame: _linearise(model, prior, delta, items, *frame), np.arange(d)
+
+
+class _Pass(NamedTuple):
+    """What one pass of an update found, no more than is needed after it: a loop is slow to hand on much."""
+
+    optimal: Float[Array, " d"]  # the error that is best by it
+    A: Float[Array, "s s"]
+    inverse: Inverse
+    weights: Float[Array, " n"]
+    used: Bool[Array, " n"]
+    distance: Float[Array, " n"]  # of the items once the error is corrected
+    log_det: Float[Array, ""]  # of the noise of the items used
+    nis: Float[Array, ""]
+
+
+def update(
+    model: Model[Mean],
+    belief: Belief[Mean],
+    items: PyTree[Array],
+    observed: Float[Array, "n m"],
+    mask: Bool[Array, " n"],
+    *,
+    passes: int = 4,
+    robust: Robust | None = None,
+    noise_scale: Float[Array, " n"] | None = None,
+) -> tuple[Belief[Mean], Diagnostics]:
+    """The belief after the measurements of one frame.
+
+    `items` is what `model.measure` takes, with a leading axis n; `mask` False leaves an item out. `passes`
+    counts the linearisations (Gauss-Newton on the posterior, Bell & Cathey 1993): one is the plain EKF.
+    With `robust`, the passes before the last bring the weights down; eight or nine are needed. `noise_scale` is the
+    standard deviation of each item's noise over what the model says, where something more is known of it.
+    """
+    P, mean = belief.covariance, belief.mean
+    dtype, d = P.dtype, P.shape[0]
+    linearise, support = _measuring(model, d, items, mask)
+    noise_scale, observed = replace_masked(mask, noise_scale, 1.0), replace_masked(mask, observed, 0.0)
+    valid, prior = mask.astype(dtype), Prior.of(P, support)
+    considered = getattr(model, "considered", None)
+
+    def correct(error: Array) -> Array:
+        return error if considered is None else jnp.where(considered, 0.0, error)
+
+    def iterate(k: Array, before: Array) -> _Pass:
+        delta = correct(before)
+        evidence = linearise(mean, delta, observed, mask, noise_scale)
+        weights, used = valid, mask
+        if robust is not None:
+            distance = evidence.distance
+            weights = valid * robust.weights(distance, k, passes)
+            used = mask & (distance < robust.gate.astype(dtype))
+            weights = jnp.where((k == passes - 1) & ~used, 0.0, weights)
+        A, b = evidence.normal_equations(weights)
+        at = delta[support]
+        b = b + A @ at
+        inverse = prior.inverse(A)
+        optimal = prior.error(inverse, b)
+        # nu' S^-1 nu without S: by the solution's own normal equations, free of cancellation.
+        best = optimal[support]
+        left = distance = evidence.distance_after(best - at)
+        if considered is not None:
+            distance = evidence.distance_after(correct(optimal)[support] - at)
+        nis = jnp.sum(jnp.where(used, left, 0.0)) + best @ (b - A @ best)
+        log_det = jnp.sum(jnp.where(used, evidence.log_det, 0.0))
+        return _Pass(optimal, A, inverse, weights, used, distance, log_det, nis)
+
+    # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
+    zero, matrix, each = (jnp.zeros(shape, dtype) for shape in ((), (len(support), len(support)), len(mask)))
+    last = _Pass(jnp.zeros(d, dtype), matrix, Inverse(matrix, zero), valid, mask, each, zero, zero)
+    last = jax.lax.fori_loop(0, passes, lambda k, found: iterate(k, found.optimal), last)
+    optimal, A, inverse, weights, used, distance, noise_log_det, nis = last
+    covariance = prior.posterior(A, inverse)
+    final = correct(optimal)
+    if considered is not None:
+        # The gain of all other components is the optimal one, and so is what they have in common with these.
+        covariance = jnp.where(jnp.logical_and.outer(considered, considered), P, covariance)
+
+    moved = model.retract(mean, final)
+    # The error now lives at the new mean: carry the covariance there.
+    reset = change_of_origin(model, mean, final, moved)
+    posterior = Belief(moved, reset @ covariance @ reset.T)
+
+    diagnostics = Diagnostics.of(
+        nis, inverse.log_det + noise_log_det, observed.shape[1], mask, used, weights=weights, distance=distance
+    )
+    return unless_overflown(belief, posterior, diagnostics)[:2]
+
+
+def step(
+    model: Model[Mean],
+    belief: Belief[Mean],
+    items: PyTree[Array],
+    observed: Float[Array, "n m"],
+    mask: Bool[Array, " n"],
+    dt: Float[Array, ""] | float = 1.0,
+    *,
+    passes: int = 4,
+    robust: Robust | None = None,
+) -> tuple[Belief[Mean], Diagnostics]:
+    """Predict to the next frame and update with it."""
+    return update(model, predict(model, belief, dt), items, observed, mask, passes=passes, robust=robust)
+
+
+def filter(
+    model: Model[Mean],
+    belief: Belief[Mean],
+    items: PyTree[Array],
+    observed: Float[Array, "t n m"],
+    mask: Bool[Array, "t n"],
+    dt: Float[Array, " t"] | None = None,
+    *,
+    passes: int = 4,
+    robust: Robust | None = None,
+    block: int = 1,
+) -> tuple[Belief[Mean], Diagnostics]:
+    """Beliefs and diagnostics of all frames, stacked along a leading axis t.
+
+    `belief` stands before the first frame, which is predicted to. `items` are the same in every frame;
+    `dt` is one per frame, 1 by default. A reverse gradient keeps a belief a frame; of a long sequence, with
+    `block`, one in every `block` frames: `jaxtri.filters.scan`.
+    """
+    if dt is None:
+        dt = jnp.ones(observed.shape[0], belief.covariance.dtype)
+    items = prepare(model, items, mask.any(axis=0))
+
+    def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
+        z, seen, elapsed = frame
+        carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
+        return carry, (carry, diagnostics)
+
+    # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.
+    return checkpointed(body, belief, (observed, mask, dt), block)[1]
