@@ -31,7 +31,7 @@ import numpy as np
 from jaxlie import SO3
 from jaxtri import ekf
 from jaxtri.models.trifocal import Trifocal, start
-from jaxtri.two_view import TwoView
+from jaxtri.estimation.two_view import TwoView
 
 rng = np.random.default_rng(0)
 points = rng.uniform([-1, -1, 3], [1, 1, 5], (300, 3))

@@ -30,10 +30,10 @@ from jaxtyping import Array
 
 jax.config.update("jax_enable_x64", True)
 
+from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
 from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, consistent_start, start  # noqa: E402
 from jaxtri.synthetic import paper_experiment  # noqa: E402
-from jaxtri.two_view import TwoView, refine  # noqa: E402
 
 
 class Sequence(NamedTuple):

@@ -21,6 +21,7 @@ from jaxlie import SE3, SO3
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
+from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters import ekf, schmidt
 from jaxtri.geometry.epipolar import homogeneous
 from jaxtri.geometry.trifocal import project
@@ -30,7 +31,6 @@ from jaxtri.models.depth import Bank, Depth, scale_variance, triangulate
 from jaxtri.models.motion import Kinematics
 from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal, consistent_start, informative, start
 from jaxtri.synthetic.experiment import Experiment, paper_experiment
-from jaxtri.two_view import TwoView, refine
 
 ACCELERATION, ANGULAR_ACCELERATION = 0.01, 0.02  # metres, radians per frame^2: the motion is drawn anew every frame
 

@@ -35,11 +35,11 @@ from paper_filters import METHODS, NAMES, STYLES, Estimate, draw, over_trials, p
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri.bound import filtering_bound  # noqa: E402
+from jaxtri.estimation.bound import filtering_bound  # noqa: E402
+from jaxtri.estimation.two_view import TwoView  # noqa: E402
 from jaxtri.geometry.pose import euler_from_matrix  # noqa: E402
 from jaxtri.io import atomic_path  # noqa: E402
 from jaxtri.synthetic import Experiment  # noqa: E402
-from jaxtri.two_view import TwoView  # noqa: E402
 
 # Roll, pitch, yaw (degrees), tx, ty, tz (m), total rotation (degrees, %), total translation (m, %).
 PAPER = {

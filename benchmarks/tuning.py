@@ -54,7 +54,10 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import replay, tuning  # noqa: E402
+from jaxtri import replay  # noqa: E402
+from jaxtri.estimation import tuning  # noqa: E402
+from jaxtri.estimation.tuning import Parameter  # noqa: E402
+from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
 from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
 from jaxtri.io import atomic_path, read_camera, read_tum  # noqa: E402
@@ -67,8 +70,6 @@ from jaxtri.replay import Recording  # noqa: E402
 from jaxtri.synthetic import paper_experiment  # noqa: E402
 from jaxtri.tracker import Settings  # noqa: E402
 from jaxtri.trajectory import evaluate  # noqa: E402
-from jaxtri.tuning import Parameter  # noqa: E402
-from jaxtri.two_view import TwoView, refine  # noqa: E402
 from jaxtri.vision.klt import KLTSettings  # noqa: E402
 from jaxtri.vision.video import open_source  # noqa: E402
 

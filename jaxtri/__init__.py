@@ -16,7 +16,6 @@ Conventions, written here once:
 
 from jaxtri import segments as segments
 from jaxtri import tracker as tracker
-from jaxtri.bound import filtering_bound, smoothing_bound
 from jaxtri.errors import (
     CameraError,
     InitialisationError,
@@ -28,6 +27,8 @@ from jaxtri.errors import (
     TruncatedVideoWarning,
     VideoError,
 )
+from jaxtri.estimation.bound import filtering_bound, smoothing_bound
+from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters import ekf as ekf
 from jaxtri.filters import schmidt as schmidt
 from jaxtri.filters.ekf import Diagnostics, Robust
@@ -43,7 +44,6 @@ from jaxtri.models.trifocal import Trifocal, TrifocalState
 from jaxtri.models.two_step import TwoStep
 from jaxtri.tracker import Settings, Status
 from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
-from jaxtri.two_view import TwoView, refine
 
 __all__ = [
     "Bank",

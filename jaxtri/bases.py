@@ -13,10 +13,10 @@ from jaxtyping import Array
 
 from jaxtri import segments, tracker
 from jaxtri.compilation import capacity
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.pose import compose, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.tracker import Report, Settings, Status
-from jaxtri.two_view import TwoView
 from jaxtri.vision.initialise import Hypothesis, hypotheses
 
 

@@ -31,11 +31,11 @@ from jaxtri.bases import (
     no_points,
 )
 from jaxtri.errors import InitialisationError, InputError
+from jaxtri.estimation.two_view import scaled
 from jaxtri.geometry.camera import Camera
 from jaxtri.replay import Recording
 from jaxtri.tracker import Report, Settings, Status
 from jaxtri.trajectory import Trajectory
-from jaxtri.two_view import scaled
 from jaxtri.vision.klt import FrameTracks
 
 

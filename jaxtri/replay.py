@@ -16,11 +16,11 @@ from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri import segments, tracker
+from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters.scan import checkpointed
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import compose, shear
 from jaxtri.tracker import Report, Settings
-from jaxtri.two_view import TwoView, refine
 
 
 class Recording(eqx.Module):

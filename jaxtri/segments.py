@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.estimation.two_view import TwoView, refine, scaled
 from jaxtri.filters import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
 from jaxtri.geometry.pose import adjoint, multiply, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
 from jaxtri.tracker import Report, Settings, Status, judge, median, noise_scale, structure_model
-from jaxtri.two_view import TwoView, refine, scaled
 
 
 class Placement(NamedTuple):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from jaxlie import SO3
 
-from jaxtri.bound import filtering_bound
+from jaxtri.estimation.bound import filtering_bound
+from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf, schmidt
 from jaxtri.geometry.pose import retract, shear
 from jaxtri.models import base_frames, trifocal
@@ -14,7 +15,6 @@ from jaxtri.models.base_frames import BaseFrames
 from jaxtri.models.motion import POSE_ROWS
 from jaxtri.models.trifocal import Trifocal
 from jaxtri.synthetic.experiment import paper_experiment
-from jaxtri.two_view import refine
 
 SD = {"velocity_sd": 0.01, "angular_velocity_sd": 0.02}
 MOTION = (jnp.asarray(0.01), jnp.asarray(0.02))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from jaxlie import SO3
 
-from jaxtri.bound import filtering_bound
+from jaxtri.estimation.bound import filtering_bound
+from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import compose, log_pose, matrix_from_euler, relative
 from jaxtri.models import structure_and_motion as sam
@@ -15,7 +16,6 @@ from jaxtri.models import two_step
 from jaxtri.models.depth import Depth, WorldPoint, triangulate
 from jaxtri.models.motion import Kinematics, at_rest
 from jaxtri.synthetic.experiment import paper_experiment
-from jaxtri.two_view import refine
 
 MOTION = jnp.array([0.01, 0.02])
 SD = {"velocity_sd": 0.01, "angular_velocity_sd": 0.02}

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
+from jaxtri.estimation.two_view import refine
 from jaxtri.geometry.pose import compose, exp_pose
 from jaxtri.models.depth import Depth, scale_variance, triangulate
 from jaxtri.synthetic.experiment import paper_experiment
-from jaxtri.two_view import refine
 
 SIGMA = 5e-4
 SHIFT = np.linspace(0, 1, 13)[:, None] * [0.5, 0.1, -0.05]  # translation of the 12 frames after the first

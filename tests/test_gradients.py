@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxtri import tracker
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf, schmidt
 from jaxtri.filters.linalg import regression
 from jaxtri.geometry.pose import compose, shear
@@ -27,7 +28,6 @@ from jaxtri.models import structure_and_motion as sam
 from jaxtri.models.base_frames import BaseFrames
 from jaxtri.models.depth import Depth
 from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal
-from jaxtri.two_view import TwoView
 
 N, FRAMES, SIGMA = 12, 6, 1e-3
 OUTLIER, ENDS, NEVER = 3, 5, 7  # points

@@ -21,8 +21,8 @@ def imports(path: Path) -> set[str]:
 
 def test_the_core_loads_without_opencv_or_matplotlib():
     code = (
-        "import sys, jaxtri, jaxtri.filters.ekf, jaxtri.models.trifocal, jaxtri.models.base_pairs, jaxtri.two_view, "
-        "jaxtri.tracker, jaxtri.segments, jaxtri.keyframes, jaxtri.trajectory, jaxtri.io, jaxtri.synthetic\n"
+        "import sys, jaxtri, jaxtri.filters.ekf, jaxtri.models.trifocal, jaxtri.models.base_pairs, "
+        "jaxtri.estimation.two_view, jaxtri.tracker, jaxtri.segments, jaxtri.keyframes, jaxtri.trajectory, jaxtri.io, jaxtri.synthetic\n"
         "print(sorted({'cv2', 'matplotlib', 'tqdm', 'tyro'} & set(sys.modules)))\n"
         "import jax; print(jax.config.jax_enable_x64)"
     )

@@ -9,11 +9,11 @@ from jaxlie import SE3, SO3
 from scipy.spatial.transform import Rotation
 
 from jaxtri import segments, tracker
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import compose, exp_pose, local, log_pose, multiply, relative, retract
 from jaxtri.models.point_noise import PointNoise
 from jaxtri.tracker import Settings, Status
-from jaxtri.two_view import TwoView
 
 N, FRAMES, SECOND = 64, 25, 5  # slots, frames, the second base frame
 CAMERA = Camera.from_parameters(500, 500, 320, 240, width=640, height=480)

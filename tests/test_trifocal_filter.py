@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
+from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import euler_from_matrix, matrix_from_euler, rotation_matrix
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, twist_noise
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
 from jaxtri.synthetic.experiment import paper_experiment
-from jaxtri.two_view import refine
 
 POSE = jnp.array([0, 1, 2, 6, 7, 8])  # rows of the current translation and rotation
 NOISE = jnp.array([0.01, 0.02, 0.0])  # acceleration, angular acceleration, drift of the base pose

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
 from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
 from jaxtri.filters.linalg import regression
@@ -29,7 +30,6 @@ from jaxtri.filters.schmidt import ConsiderBelief, Measured
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.geometry.pose import local, retract, shear
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, from_two_view, twist_noise
-from jaxtri.two_view import TwoView, sensitivity
 
 
 class Points(NamedTuple):

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
-from jaxtri.two_view import TwoView
 
 
 class Bank(NamedTuple):

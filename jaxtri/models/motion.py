@@ -9,6 +9,7 @@ import numpy as np
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Float
 
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters.model import Belief
 from jaxtri.geometry.pose import (
     compose,
@@ -21,7 +22,6 @@ from jaxtri.geometry.pose import (
     rotation_matrix,
     shear,
 )
-from jaxtri.two_view import TwoView
 
 # Of the errors of `Kinematics`, those of the pose: translation and rotation.
 POSE_ROWS = np.array([0, 1, 2, 6, 7, 8])

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters.model import Belief
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous
 from jaxtri.geometry.pose import local, retract
 from jaxtri.models.depth import triangulate
 from jaxtri.models.motion import Kinematics, acceleration_noise, at_rest, from_two_view
-from jaxtri.two_view import TwoView
 
 
 class StructureAndMotionState(eqx.Module):

@@ -15,6 +15,7 @@ import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
 from jaxtri.filters.model import Belief
 from jaxtri.filters.schmidt import Measured
@@ -22,7 +23,6 @@ from jaxtri.geometry.epipolar import homogeneous, inverse_depth, perpendicular_l
 from jaxtri.geometry.pose import difference, local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
 from jaxtri.models.motion import POSE_ROWS, Kinematics, MotionStart, acceleration_noise, from_two_view
-from jaxtri.two_view import TwoView, sensitivity
 
 
 class Mode(NamedTuple):

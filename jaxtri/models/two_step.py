@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf
 from jaxtri.filters.scan import checkpointed
 from jaxtri.geometry.pose import local, retract
 from jaxtri.geometry.trifocal import project
 from jaxtri.models.depth import Bank, Depth, WorldPoint
 from jaxtri.models.motion import Kinematics, acceleration_noise, at_rest, from_two_view
-from jaxtri.two_view import TwoView
 
 
 class KnownStructure(eqx.Module):

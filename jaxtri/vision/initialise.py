@@ -9,7 +9,7 @@ import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
-from jaxtri import two_view
+from jaxtri.estimation import two_view
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 
 HYPOTHESES = 8  # of fixed number, so that one compilation serves

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
+from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf, projective
 from jaxtri.models.base_pairs import BasePairs, base_point
 from jaxtri.models.motion import Twist
 from jaxtri.models.trifocal import Trifocal, start
 from jaxtri.synthetic.experiment import paper_experiment
-from jaxtri.two_view import refine
 
 FRAMES, POINTS = 93, 40
 ROBUST = ekf.Robust()

@@ -7,10 +7,10 @@ import pytest
 from jaxlie import SO3
 
 import jaxtri
+from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf
 from jaxtri.models.trifocal import start
 from jaxtri.synthetic import paper_experiment
-from jaxtri.two_view import refine
 
 
 @pytest.mark.parametrize("size", [None, 1, 2, 5, 9])

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.estimation.two_view import tangent_basis
 from jaxtri.geometry.epipolar import dehomogenise, safe_norm
-from jaxtri.two_view import tangent_basis
 
 
 class _Normal(NamedTuple):

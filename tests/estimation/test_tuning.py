@@ -8,10 +8,10 @@ from jaxlie import SE3
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
-from jaxtri import tuning
 from jaxtri.errors import InputError
+from jaxtri.estimation import tuning
+from jaxtri.estimation.tuning import Parameter
 from jaxtri.filters import ekf
-from jaxtri.tuning import Parameter
 
 
 class Walk(eqx.Module):

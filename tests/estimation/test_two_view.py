@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxlie import SO3
 
+from jaxtri.estimation.two_view import refine
 from jaxtri.geometry.epipolar import essential, sampson
-from jaxtri.two_view import refine
 
 N, SIGMA = 40, 1e-3
 R = SO3.exp(jnp.array([0.1, -0.05, 0.08]))

@@ -7,7 +7,7 @@ import optimistix as optx
 import pytest
 from jaxlie import SO3
 
-from jaxtri.bound import filtering_bound, smoothing_bound
+from jaxtri.estimation.bound import filtering_bound, smoothing_bound
 from jaxtri.synthetic.experiment import paper_experiment
 
 
