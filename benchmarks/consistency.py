@@ -58,7 +58,7 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxtri.estimation.bound import filtering_bound  # noqa: E402
 from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
-from jaxtri.io import atomic_path  # noqa: E402
+from jaxtri.formats import atomic_path  # noqa: E402
 from jaxtri.synthetic import Experiment, paper_experiment, steady_experiment  # noqa: E402
 
 MODES = ("default", "consistent", "bases8", "paper", "two_step_good", "ap_good")

@@ -15,7 +15,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxtri.io import atomic_path, write_json
+from jaxtri.formats import atomic_path, write_json
 from jaxtri.results import versions
 
 

@@ -40,7 +40,7 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
 from jaxtri.filters import ekf, schmidt  # noqa: E402
-from jaxtri.io import atomic_path  # noqa: E402
+from jaxtri.formats import atomic_path  # noqa: E402
 from jaxtri.models import base_frames  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, consistent_start, informative, start  # noqa: E402
 from jaxtri.synthetic.experiment import Experiment, paper_experiment  # noqa: E402

@@ -26,7 +26,7 @@ from paper_filters import METHODS, NAMES, STYLES, Trials, draw, over_trials, rep
 jax.config.update("jax_enable_x64", True)
 
 from jaxtri.estimation.two_view import TwoView  # noqa: E402
-from jaxtri.io import atomic_path  # noqa: E402
+from jaxtri.formats import atomic_path  # noqa: E402
 from jaxtri.synthetic import Experiment  # noqa: E402
 
 FOCAL_PX = 600.0

@@ -37,8 +37,8 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxtri.estimation.bound import filtering_bound  # noqa: E402
 from jaxtri.estimation.two_view import TwoView  # noqa: E402
+from jaxtri.formats import atomic_path  # noqa: E402
 from jaxtri.geometry.pose import euler_from_matrix  # noqa: E402
-from jaxtri.io import atomic_path  # noqa: E402
 from jaxtri.synthetic import Experiment  # noqa: E402
 
 # Roll, pitch, yaw (degrees), tx, ty, tz (m), total rotation (degrees, %), total translation (m, %).

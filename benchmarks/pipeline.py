@@ -28,8 +28,8 @@ from contract import parser, report, table
 
 jax.config.update("jax_enable_x64", True)
 
+from jaxtri.formats import read_camera  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
-from jaxtri.io import read_camera  # noqa: E402
 from jaxtri.pipeline import Run, track  # noqa: E402
 from jaxtri.synthetic import laboratory  # noqa: E402
 from jaxtri.vision.klt import KLTSettings  # noqa: E402

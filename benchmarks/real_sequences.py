@@ -29,7 +29,7 @@ from contract import parser, report, table
 jax.config.update("jax_enable_x64", True)
 
 from jaxtri.bases import Base  # noqa: E402
-from jaxtri.io import atomic_path, read_camera, read_tum  # noqa: E402
+from jaxtri.formats import atomic_path, read_camera, read_tum  # noqa: E402
 from jaxtri.pipeline import Run, follow_tracks, track  # noqa: E402
 from jaxtri.plot import plot_trajectory  # noqa: E402
 from jaxtri.trajectory import Evaluation, Trajectory, align, evaluate  # noqa: E402

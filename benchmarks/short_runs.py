@@ -35,9 +35,9 @@ jax.config.update("jax_enable_x64", "--float32" not in sys.argv)
 
 from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
 from jaxtri.filters import ekf, schmidt  # noqa: E402
+from jaxtri.formats import atomic_path  # noqa: E402
 from jaxtri.geometry.epipolar import safe_norm  # noqa: E402
 from jaxtri.geometry.trifocal import project  # noqa: E402
-from jaxtri.io import atomic_path  # noqa: E402
 from jaxtri.models import base_frames  # noqa: E402
 from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal, consistent_start, informative, start  # noqa: E402
 

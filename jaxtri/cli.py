@@ -169,8 +169,8 @@ def _base(name: str) -> Any:
 
 
 def _camera(options: Track, size: tuple[int, int]) -> Any:
+    from jaxtri.formats import read_camera
     from jaxtri.geometry.camera import Camera
-    from jaxtri.io import read_camera
 
     if options.camera is not None and options.fov is None:
         return read_camera(options.camera, width=size[0], height=size[1])
@@ -215,7 +215,7 @@ def _summarise(run: Any, paths: list[Path]) -> None:
 
 
 def _evaluate(options: Evaluate) -> None:
-    from jaxtri.io import read_trajectory, write_json
+    from jaxtri.formats import read_trajectory, write_json
     from jaxtri.trajectory import evaluate
 
     found = evaluate(read_trajectory(options.estimate), read_trajectory(options.groundtruth), with_scale=options.scale)
@@ -233,7 +233,7 @@ def _print_errors(found: Any) -> None:
 
 
 def _demo(options: Demo) -> None:
-    from jaxtri.io import read_tum
+    from jaxtri.formats import read_tum
     from jaxtri.pipeline import warm_up
     from jaxtri.results import write_overlay, write_results
     from jaxtri.synthetic import laboratory

@@ -9,8 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxtri.errors import InputError
+from jaxtri.formats import atomic_path, write_json, write_ply, write_tum
 from jaxtri.geometry.camera import Camera
-from jaxtri.io import atomic_path, write_json, write_ply, write_tum
 from jaxtri.pipeline import Run
 from jaxtri.plot import plot_trajectory
 from jaxtri.tracker import Status

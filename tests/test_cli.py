@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxtri.cli import main
-from jaxtri.io import read_tum
+from jaxtri.formats import read_tum
 from jaxtri.vision.rendered import write_laboratory
 from jaxtri.vision.video import write_video
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxtri.compilation import capacity
-from jaxtri.io import read_camera
+from jaxtri.formats import read_camera
 from jaxtri.odometry import Odometry
 from jaxtri.vision.klt import KLT, KLTSettings
 from jaxtri.vision.video import open_source

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtri.bases import StartSettings
-from jaxtri.io import read_camera
+from jaxtri.formats import read_camera
 from jaxtri.odometry import Odometry
 from jaxtri.pipeline import track
 from jaxtri.tracker import Settings

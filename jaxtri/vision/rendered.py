@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from jaxtri.formats import atomic_path, write_json, write_tum
 from jaxtri.geometry.camera import Camera
-from jaxtri.io import atomic_path, write_json, write_tum
 from jaxtri.synthetic.laboratory import Footage, laboratory
 from jaxtri.synthetic.scene import rendered_sequence
 from jaxtri.trajectory import Trajectory

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxtri.errors import ResolutionChangeError, TruncatedVideoError, TruncatedVideoWarning, VideoError
-from jaxtri.io import atomic_path
+from jaxtri.formats import atomic_path
 from jaxtri.vision.readers import IMAGE_SUFFIXES, Capture, Folder, Item, quiet
 
 DEFAULT_FPS = 25.0

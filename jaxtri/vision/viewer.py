@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxtri.errors import JaxtriError
+from jaxtri.formats import atomic_path
 from jaxtri.geometry.camera import Camera
-from jaxtri.io import atomic_path
 from jaxtri.pipeline import Run
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxtri import io
+from jaxtri import formats
 from jaxtri.errors import CameraError, InputError, TrajectoryError
 from jaxtri.geometry.camera import BrownConrady, Fisheye
 from jaxtri.trajectory import Trajectory
@@ -66,20 +66,20 @@ def a_trajectory(t=20):
 def test_camera_json(tmp_path):
     k = [-0.3, 0.08, 1e-3, 2e-3, 0.0]
     entries = GOOD | {"model": "pinhole", "distortion_model": "opencv_radtan (k1,k2,..)", "distortion": k}
-    camera = io.read_camera(write(tmp_path / "c.json", entries | {"skew": -7.5}))
+    camera = formats.read_camera(write(tmp_path / "c.json", entries | {"skew": -7.5}))
     assert values(camera) == list(GOOD.values())
     assert float(camera.skew) == -7.5
     assert isinstance(camera.distortion, BrownConrady)
     np.testing.assert_array_equal(camera.distortion.coefficients, [*k, 0, 0, 0])
-    assert io.read_camera(write(tmp_path / "c.json", entries | {"distortion": [0] * 5})).distortion is None
+    assert formats.read_camera(write(tmp_path / "c.json", entries | {"distortion": [0] * 5})).distortion is None
     for name in ("fisheye", "opencv_fisheye", "kannala_brandt"):
         for key in ("model", "distortion_model"):
-            fisheye = io.read_camera(write(tmp_path / "c.json", GOOD | {key: name, "distortion": [0.1, 0.2]}))
+            fisheye = formats.read_camera(write(tmp_path / "c.json", GOOD | {key: name, "distortion": [0.1, 0.2]}))
             assert isinstance(fisheye.distortion, Fisheye)
             np.testing.assert_array_equal(fisheye.distortion.coefficients, [0.1, 0.2, 0, 0])
     bare = {key: value for key, value in GOOD.items() if key not in ("width", "height")}
     path = write(tmp_path / "c.json", bare | {"cy": -1070.5})
-    assert (io.read_camera(path).width, io.read_camera(path, width=640).width) == (None, 640)
+    assert (formats.read_camera(path).width, formats.read_camera(path, width=640).width) == (None, 640)
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
@@ -94,7 +94,7 @@ def test_camera_of_opencv(tmp_path, suffix, key):
     storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]))
     storage.write(key, k)
     storage.release()
-    camera = io.read_camera(path)
+    camera = formats.read_camera(path)
     assert values(camera) == list(GOOD.values())
     assert camera.distortion is not None
     np.testing.assert_array_equal(camera.distortion.coefficients, [*k[0], 0, 0, 0])
@@ -107,7 +107,7 @@ def test_camera_of_ros(tmp_path, head):
         ("equidistant", [0.0] * 4, Fisheye),
     ):
         text = head + ROS.format(model=model, n=len(k), values=k)
-        camera = io.read_camera(write(tmp_path / "c.yaml", text))
+        camera = formats.read_camera(write(tmp_path / "c.yaml", text))
         assert values(camera) == list(GOOD.values())
         assert isinstance(camera.distortion, kind)
         np.testing.assert_array_equal(camera.distortion.coefficients[: len(k)], k)
@@ -138,17 +138,17 @@ def test_camera_of_ros(tmp_path, head):
 def test_bad_camera_names_file_and_key(tmp_path, change, message):
     entries = {key: value for key, value in (GOOD | change).items() if value is not None}
     with pytest.raises(CameraError, match=rf"bad\.json: .*{message}"):
-        io.read_camera(write(tmp_path / "bad.json", entries))
+        formats.read_camera(write(tmp_path / "bad.json", entries))
 
 
 def test_unreadable_cameras(tmp_path):
     with pytest.raises(CameraError, match=r"640, but 1280 was asked for"):
-        io.read_camera(write(tmp_path / "c.json", GOOD), width=1280)
+        formats.read_camera(write(tmp_path / "c.json", GOOD), width=1280)
     with pytest.raises(CameraError, match=r"none\.json: cannot be read"):
-        io.read_camera(tmp_path / "none.json")
+        formats.read_camera(tmp_path / "none.json")
     for content in ("{", "[1, 2]", "", "fx 500\nfy", "<?xml version='1.0'?><a>", "\x00\x01\x02"):
         with pytest.raises(CameraError, match=r"c\.txt: "):
-            io.read_camera(write(tmp_path / "c.txt", content))
+            formats.read_camera(write(tmp_path / "c.txt", content))
 
 
 def test_shared_cameras_and_trajectories_if_present():
@@ -156,11 +156,11 @@ def test_shared_cameras_and_trajectories_if_present():
     if not folders:
         pytest.skip("no shared data beside the repository")
     for folder in folders:
-        camera = io.read_camera(folder / "camera.json")
-        trajectory = io.read_trajectory(folder / "groundtruth.txt")
+        camera = formats.read_camera(folder / "camera.json")
+        trajectory = formats.read_trajectory(folder / "groundtruth.txt")
         assert camera.width is not None or folder.name == "tracks_oxford_dinosaur"
         if (folder / "timestamps.txt").exists():
-            times = io.read_timestamps(folder / "timestamps.txt")
+            times = formats.read_timestamps(folder / "timestamps.txt")
             assert np.isin(trajectory.times, times).all()
 
 
@@ -171,24 +171,24 @@ def test_shared_cameras_and_trajectories_if_present():
 def test_trajectory_round_trip(tmp_path, form):
     trajectory, path = a_trajectory(), tmp_path / "new" / "folder" / "t.txt"
     getattr(io, f"write_{form}")(path, trajectory)
-    for back in (getattr(io, f"read_{form}")(path), io.read_trajectory(path)):
+    for back in (getattr(io, f"read_{form}")(path), formats.read_trajectory(path)):
         np.testing.assert_allclose(back.positions, trajectory.positions, rtol=1e-14)
         np.testing.assert_allclose(back.rotations, trajectory.rotations, atol=1e-14)
         expected = np.arange(20.0) if form == "kitti" else trajectory.times
         np.testing.assert_allclose(back.times, expected, rtol=0, atol=3e-7)  # a double at 1.4e9 s
     if form == "kitti":
-        np.testing.assert_array_equal(io.read_kitti(path, trajectory.times).times, trajectory.times)
+        np.testing.assert_array_equal(formats.read_kitti(path, trajectory.times).times, trajectory.times)
 
 
 def test_quaternions_are_in_the_order_of_each_format(tmp_path):
     q = Rotation.from_rotvec([0.3, -0.2, 0.9])
     T = np.eye(4)[None].copy()
     T[0, :3, :3] = q.as_matrix()
-    io.write_tum(tmp_path / "t", Trajectory(np.zeros(1), T), header="two\nlines")
+    formats.write_tum(tmp_path / "t", Trajectory(np.zeros(1), T), header="two\nlines")
     lines = (tmp_path / "t").read_text().splitlines()
     assert lines[:2] == ["# two", "# lines"]
     np.testing.assert_allclose([float(x) for x in lines[2].split()[4:]], q.as_quat())
-    io.write_euroc(tmp_path / "e", Trajectory(np.ones(1), T))
+    formats.write_euroc(tmp_path / "e", Trajectory(np.ones(1), T))
     *_, line = (tmp_path / "e").read_text().splitlines()
     assert line.startswith("1000000000,0,0,0,")
     np.testing.assert_allclose([float(x) for x in line.split(",")[4:]], q.as_quat()[[3, 0, 1, 2]])
@@ -196,13 +196,13 @@ def test_quaternions_are_in_the_order_of_each_format(tmp_path):
 
 def test_comments_blank_lines_and_further_columns_are_skipped(tmp_path):
     tum = "\ufeff# head\n\n0 1 2 3 0 0 0 1  # the first\r\n\n1 1 2 3 0 0 0 1\n"
-    assert len(io.read_trajectory(write(tmp_path / "t", tum))) == 2
+    assert len(formats.read_trajectory(write(tmp_path / "t", tum))) == 2
     euroc = "#timestamp, p_RS_R_x [m], ...\n1000000000,1,2,3,1,0,0,0,0.1,0.2\n"
-    trajectory = io.read_trajectory(write(tmp_path / "t", euroc))
+    trajectory = formats.read_trajectory(write(tmp_path / "t", euroc))
     np.testing.assert_array_equal(trajectory.positions, [[1, 2, 3]])
     np.testing.assert_array_equal(trajectory.times, [1.0])
     stamps = "# seconds file\n0.0 frames/0.jpg\n0.1 a name with blanks.jpg\n\n0.2\n"
-    np.testing.assert_array_equal(io.read_timestamps(write(tmp_path / "t", stamps)), [0, 0.1, 0.2])
+    np.testing.assert_array_equal(formats.read_timestamps(write(tmp_path / "t", stamps)), [0, 0.1, 0.2])
 
 
 ROW = "1 2 3 0 0 0 1"
@@ -225,7 +225,7 @@ ROW = "1 2 3 0 0 0 1"
 )
 def test_bad_trajectory_names_file_and_line(tmp_path, content, message):
     with pytest.raises(TrajectoryError, match=message):
-        io.read_trajectory(write(tmp_path / "bad", content))
+        formats.read_trajectory(write(tmp_path / "bad", content))
 
 
 def test_bad_timestamps_and_missing_files(tmp_path):
@@ -236,11 +236,11 @@ def test_bad_timestamps_and_missing_files(tmp_path):
         ("\n", "holds no data"),
     ):
         with pytest.raises(InputError, match=message):
-            io.read_timestamps(write(tmp_path / "bad", content))
+            formats.read_timestamps(write(tmp_path / "bad", content))
     with pytest.raises(InputError, match="cannot be read"):
-        io.read_timestamps(tmp_path)
+        formats.read_timestamps(tmp_path)
     with pytest.raises(TrajectoryError, match="cannot be read"):
-        io.read_trajectory(tmp_path / "none")
+        formats.read_trajectory(tmp_path / "none")
 
 
 # Writers
@@ -249,7 +249,7 @@ def test_bad_timestamps_and_missing_files(tmp_path):
 def test_ply_holds_what_was_given(tmp_path):
     rng = np.random.default_rng(0)
     points, colours = rng.normal(size=(7, 3)), rng.integers(0, 256, (7, 3), dtype=np.uint8)
-    io.write_ply(tmp_path / "p.ply", points, colours, {"sigma": np.arange(7.0)})
+    formats.write_ply(tmp_path / "p.ply", points, colours, {"sigma": np.arange(7.0)})
     head, _, body = (tmp_path / "p.ply").read_bytes().partition(b"end_header\n")
     kinds = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
     names = ["x", "y", "z", "red", "green", "blue", "sigma"]
@@ -257,11 +257,11 @@ def test_ply_holds_what_was_given(tmp_path):
     assert b"element vertex 7\n" in head
     rows = np.array(list(struct.iter_unpack("<3f3Bf", body)))
     np.testing.assert_array_equal(rows, np.c_[points.astype(np.float32), colours, np.arange(7)])
-    io.write_ply(tmp_path / "p.ply", points[:0])
+    formats.write_ply(tmp_path / "p.ply", points[:0])
     assert (tmp_path / "p.ply").read_bytes().endswith(b"end_header\n")
     for extra in ({"x": np.zeros(7)}, {"two words": np.zeros(7)}, {"sigma": np.zeros((7, 1))}):
         with pytest.raises((InputError, TypeError)):
-            io.write_ply(tmp_path / "p.ply", points, colours, extra)
+            formats.write_ply(tmp_path / "p.ply", points, colours, extra)
 
 
 def test_json_is_strict(tmp_path):
@@ -272,7 +272,7 @@ def test_json_is_strict(tmp_path):
         4: a_trajectory(2),
         "n": None,
     }
-    io.write_json(tmp_path / "j.json", obj)
+    formats.write_json(tmp_path / "j.json", obj)
     back = json.loads((tmp_path / "j.json").read_text())
     assert (back["a"], back["b"], back["c"], back["n"]) == (1.5, [0, 1, 2], [None, [None, True]], None)
     assert np.shape(back["4"]["T_world_camera"]) == (2, 4, 4)
@@ -280,22 +280,22 @@ def test_json_is_strict(tmp_path):
 
 def test_nothing_half_written_is_left(tmp_path):
     path = tmp_path / "sub" / "file.txt"
-    with io.atomic_write(path) as file:
+    with formats.atomic_write(path) as file:
         file.write("old\n")
         assert not path.exists()
 
     def interrupted():
-        with io.atomic_write(path) as file:
+        with formats.atomic_write(path) as file:
             file.write("half")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     with pytest.raises(TypeError):
-        io.write_json(path, {"bad": object()})
+        formats.write_json(path, {"bad": object()})
     assert path.read_bytes() == b"old\n"
-    with pytest.raises(InputError, match="nothing was written"), io.atomic_path(path):
+    with pytest.raises(InputError, match="nothing was written"), formats.atomic_path(path):
         pass
-    with io.atomic_path(path.with_suffix(".png")) as temporary:
+    with formats.atomic_path(path.with_suffix(".png")) as temporary:
         assert cv2.imwrite(str(temporary), np.zeros((2, 2, 3), np.uint8))
     assert sorted(p.name for p in path.parent.iterdir()) == ["file.png", "file.txt"]
