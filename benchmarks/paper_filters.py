@@ -25,8 +25,9 @@ from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters import ekf, schmidt
 from jaxtri.geometry.epipolar import homogeneous
 from jaxtri.geometry.trifocal import project
-from jaxtri.models import base_frames, two_step
-from jaxtri.models import structure_and_motion as sam
+from jaxtri.models import base_frames
+from jaxtri.models.baselines import structure_and_motion as sam
+from jaxtri.models.baselines import two_step
 from jaxtri.models.depth import Bank, Depth, scale_variance, triangulate
 from jaxtri.models.motion import Kinematics
 from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal, consistent_start, informative, start

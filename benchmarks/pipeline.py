@@ -32,8 +32,8 @@ from jaxtri.formats import read_camera  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
 from jaxtri.pipeline import Run, track  # noqa: E402
 from jaxtri.synthetic import laboratory  # noqa: E402
+from jaxtri.synthetic.rendered import write_footage  # noqa: E402
 from jaxtri.vision.klt import KLTSettings  # noqa: E402
-from jaxtri.vision.rendered import write_footage  # noqa: E402
 from jaxtri.vision.video import Frame, open_source  # noqa: E402
 
 BLIND = range(50, 75)

@@ -61,7 +61,8 @@ from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
 from jaxtri.filters import ekf, schmidt  # noqa: E402
 from jaxtri.formats import atomic_path, read_camera, read_tum  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
-from jaxtri.models import structure_and_motion, trifocal  # noqa: E402
+from jaxtri.models import trifocal  # noqa: E402
+from jaxtri.models.baselines import structure_and_motion  # noqa: E402
 from jaxtri.models.motion import Kinematics  # noqa: E402
 from jaxtri.models.point_noise import PointNoise  # noqa: E402
 from jaxtri.models.trifocal import Trifocal  # noqa: E402

@@ -37,11 +37,11 @@ from jaxtri.filters.scan import batch
 from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
 from jaxtri.models.base_frames import BaseFrames, BaseFramesState
 from jaxtri.models.base_pairs import BasePairs, BasePoint
+from jaxtri.models.baselines.structure_and_motion import StructureAndMotion
+from jaxtri.models.baselines.two_step import TwoStep
 from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Kinematics, Twist
-from jaxtri.models.structure_and_motion import StructureAndMotion
 from jaxtri.models.trifocal import Trifocal, TrifocalState
-from jaxtri.models.two_step import TwoStep
 from jaxtri.tracker import Settings, Status
 from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
 

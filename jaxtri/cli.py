@@ -237,8 +237,8 @@ def _demo(options: Demo) -> None:
     from jaxtri.pipeline import warm_up
     from jaxtri.results import write_overlay, write_results
     from jaxtri.synthetic import laboratory
+    from jaxtri.synthetic.rendered import write_footage
     from jaxtri.trajectory import evaluate
-    from jaxtri.vision.rendered import write_footage
     from jaxtri.vision.video import open_source
 
     if options.frames < 2:

@@ -10,7 +10,7 @@ import pytest
 
 from jaxtri.cli import main
 from jaxtri.formats import read_tum
-from jaxtri.vision.rendered import write_laboratory
+from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.vision.video import write_video
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -10,9 +10,9 @@ from jaxtri.bases import StartSettings
 from jaxtri.formats import read_camera
 from jaxtri.odometry import Odometry
 from jaxtri.pipeline import track
+from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.tracker import Settings
 from jaxtri.vision.klt import KLT, KLTSettings
-from jaxtri.vision.rendered import write_laboratory
 from jaxtri.vision.video import open_source
 
 

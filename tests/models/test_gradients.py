@@ -23,9 +23,10 @@ from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf, schmidt
 from jaxtri.filters.linalg import regression
 from jaxtri.geometry.pose import compose, shear
-from jaxtri.models import base_frames, trifocal, two_step
-from jaxtri.models import structure_and_motion as sam
+from jaxtri.models import base_frames, trifocal
 from jaxtri.models.base_frames import BaseFrames
+from jaxtri.models.baselines import structure_and_motion as sam
+from jaxtri.models.baselines import two_step
 from jaxtri.models.depth import Depth
 from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal
 

@@ -11,8 +11,8 @@ from jaxtri.estimation.bound import filtering_bound
 from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import compose, log_pose, matrix_from_euler, relative
-from jaxtri.models import structure_and_motion as sam
-from jaxtri.models import two_step
+from jaxtri.models.baselines import structure_and_motion as sam
+from jaxtri.models.baselines import two_step
 from jaxtri.models.depth import Depth, WorldPoint, triangulate
 from jaxtri.models.motion import Kinematics, at_rest
 from jaxtri.synthetic.experiment import paper_experiment
