@@ -1,1 +1,1 @@
-"""Images through OpenCV: frames, feature tracks, hypotheses of relative poses. Nothing here decides what a filter does."""
+"""Images through OpenCV: frames, feature tracks, hypotheses of relative poses. It decides nothing."""

@@ -152,7 +152,7 @@ def test_unreadable_cameras(tmp_path):
 
 
 def test_shared_cameras_and_trajectories_if_present():
-    folders = [p.parent for p in (Path(__file__).parents[2] / "shared" / "data").glob("*/camera.json")]
+    folders = [p.parent for p in (Path(__file__).parents[3] / "shared" / "data").glob("*/camera.json")]
     if not folders:
         pytest.skip("no shared data beside the repository")
     for folder in folders:
@@ -170,8 +170,8 @@ def test_shared_cameras_and_trajectories_if_present():
 @pytest.mark.parametrize("form", ["tum", "euroc", "kitti"])
 def test_trajectory_round_trip(tmp_path, form):
     trajectory, path = a_trajectory(), tmp_path / "new" / "folder" / "t.txt"
-    getattr(io, f"write_{form}")(path, trajectory)
-    for back in (getattr(io, f"read_{form}")(path), formats.read_trajectory(path)):
+    getattr(formats, f"write_{form}")(path, trajectory)
+    for back in (getattr(formats, f"read_{form}")(path), formats.read_trajectory(path)):
         np.testing.assert_allclose(back.positions, trajectory.positions, rtol=1e-14)
         np.testing.assert_allclose(back.rotations, trajectory.rotations, atol=1e-14)
         expected = np.arange(20.0) if form == "kitti" else trajectory.times
