@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxtri.formats import atomic_path, write_json
-from jaxtri.results import versions
+from jaxtri.output.results import versions
 
 
 def parser(question: str, *, trials: int | None = None, data: bool = False) -> argparse.ArgumentParser:

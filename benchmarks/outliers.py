@@ -6,7 +6,7 @@ The paper's experiment (300 points, 0.1 px, 99 frames) with wrong points, robust
 each frame from 2 on a point stands anywhere in the image with a probability of 40 %. `persistent25`: a quarter of
 the points drifts off its true track from frame 1 on, 2 to 10 px a frame, each its own way. `moving30`: 30 % of the
 points are a second rigid object, moved by 2 to 6 mm and .2 to .6 degrees a frame. Where the pair itself has wrong
-points the start is the best hypothesis of `jaxtri.vision.initialise`, at the true length, and only its points are
+points the start is the best hypothesis of `jaxtri.vision.hypotheses`, at the true length, and only its points are
 used. Lost is a trial whose mean rotation error over the frames is above 0.1 degrees; flagged is a lost one that
 over the last ten frames used less than half of its points, or is not finite.
 
@@ -44,7 +44,7 @@ from jaxtri.formats import atomic_path  # noqa: E402
 from jaxtri.models import base_frames  # noqa: E402
 from jaxtri.models.trifocal import Trifocal, consistent_start, informative, start  # noqa: E402
 from jaxtri.synthetic.experiment import Experiment, paper_experiment  # noqa: E402
-from jaxtri.vision.initialise import hypotheses  # noqa: E402
+from jaxtri.vision.hypotheses import hypotheses  # noqa: E402
 
 MODES = ("default", "consistent", "bases8")
 QUICK = ("default", "consistent")  # the compilation of the third takes a minute

@@ -25,11 +25,11 @@ from real_sequences import plot, run_sequence
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri.bases import Base  # noqa: E402
 from jaxtri.errors import InputError  # noqa: E402
 from jaxtri.formats import atomic_path, read_camera  # noqa: E402
-from jaxtri.pipeline import Run  # noqa: E402
-from jaxtri.results import precise, write_overlay  # noqa: E402
+from jaxtri.odometry.run import Run  # noqa: E402
+from jaxtri.odometry.settings import Base  # noqa: E402
+from jaxtri.output.results import precise, write_overlay  # noqa: E402
 from jaxtri.vision.video import open_source  # noqa: E402
 
 STANDS_FOR = {

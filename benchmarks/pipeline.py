@@ -30,7 +30,7 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxtri.formats import read_camera  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
-from jaxtri.pipeline import Run, track  # noqa: E402
+from jaxtri.odometry.run import Run, track  # noqa: E402
 from jaxtri.synthetic import laboratory  # noqa: E402
 from jaxtri.synthetic.rendered import write_footage  # noqa: E402
 from jaxtri.vision.klt import KLTSettings  # noqa: E402

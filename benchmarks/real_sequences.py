@@ -28,10 +28,10 @@ from contract import parser, report, table
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri.bases import Base  # noqa: E402
 from jaxtri.formats import atomic_path, read_camera, read_tum  # noqa: E402
-from jaxtri.pipeline import Run, follow_tracks, track  # noqa: E402
-from jaxtri.plot import plot_trajectory  # noqa: E402
+from jaxtri.odometry.run import Run, follow_tracks, track  # noqa: E402
+from jaxtri.odometry.settings import Base  # noqa: E402
+from jaxtri.output.plot import plot_trajectory  # noqa: E402
 from jaxtri.trajectory import Evaluation, Trajectory, align, evaluate  # noqa: E402
 from jaxtri.vision.video import open_source  # noqa: E402
 
@@ -90,7 +90,7 @@ def dinosaur(folder: Path) -> dict[str, float]:
     posed = sum(p.T_camera_world is not None for p in odometry.poses)
     return {
         "coverage": posed / len(truth),
-        "segments": odometry.segments,
+        "segments": odometry.starts,
         "step_rotation_error_deg": float(angle(np.swapaxes(step_true, 1, 2) @ step).mean()),
         "closing_error_deg": float(angle(whole_true.T @ whole)),
         "ate_percent": errors.ate_percent,
@@ -121,7 +121,7 @@ def main() -> None:
             fps = float(run.statistics["frames_per_second"])  # pyright: ignore[reportArgumentType]
             figures |= {
                 f"{prefix}{name}.coverage": coverage,
-                f"{prefix}{name}.segments": run.odometry.segments,
+                f"{prefix}{name}.segments": run.odometry.starts,
                 f"{prefix}{name}.restarts": run.odometry.changes,
                 f"{prefix}{name}.ate_percent": errors.ate_percent,
                 f"{prefix}{name}.rotation_rmse_deg": errors.rotation_rmse_deg,
@@ -132,7 +132,7 @@ def main() -> None:
             row = [
                 name,
                 f"{coverage:.0%}",
-                run.odometry.segments,
+                run.odometry.starts,
                 run.odometry.changes,
                 f"{errors.ate_percent:.3f}",
             ]

@@ -54,7 +54,6 @@ from tqdm import tqdm
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxtri import replay  # noqa: E402
 from jaxtri.estimation import tuning  # noqa: E402
 from jaxtri.estimation.tuning import Parameter  # noqa: E402
 from jaxtri.estimation.two_view import TwoView, refine  # noqa: E402
@@ -66,10 +65,11 @@ from jaxtri.models.baselines import structure_and_motion  # noqa: E402
 from jaxtri.models.motion import Kinematics  # noqa: E402
 from jaxtri.models.point_noise import PointNoise  # noqa: E402
 from jaxtri.models.trifocal import Trifocal  # noqa: E402
-from jaxtri.pipeline import Run, track  # noqa: E402
-from jaxtri.replay import Recording  # noqa: E402
+from jaxtri.odometry import replay  # noqa: E402
+from jaxtri.odometry.replay import Recording  # noqa: E402
+from jaxtri.odometry.run import Run, track  # noqa: E402
+from jaxtri.odometry.settings import Settings  # noqa: E402
 from jaxtri.synthetic import paper_experiment  # noqa: E402
-from jaxtri.tracker import Settings  # noqa: E402
 from jaxtri.trajectory import evaluate  # noqa: E402
 from jaxtri.vision.klt import KLTSettings  # noqa: E402
 from jaxtri.vision.video import open_source  # noqa: E402

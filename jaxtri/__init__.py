@@ -6,7 +6,9 @@ Conventions, written here once:
 - A pose maps world to camera, `X_camera = R X_world + T` (Yu et al. 2006, eq. 3), and is named
   `T_camera_world`. Trajectories and their files are camera to world, named `T_world_camera`.
 - The filters work in normalised image coordinates (intrinsics and distortion removed). Pixels exist in
-  `Camera` and `jaxtri.vision` only; the centre of the top-left pixel is (0, 0). Noise is given in pixels.
+  `Camera`, `jaxtri.vision` and at the doors of `jaxtri.odometry`; the centre of the top-left pixel is (0, 0).
+- Noise is given in pixels where a camera stands beside it: `Settings.of(camera, noise_px=0.4)`, `--noise-px`. The
+  `sigma` of every model and of `Settings` is that of a normalised image point: noise_px / focal length.
 - Array axes: frame t, point n, component. Functions take one item; batch them with `jax.vmap`, whole runs with `batch`.
 - Angles are in radians, time in frames unless a `dt` is given, lengths in units of the scene.
 - The scale of a monocular reconstruction is a gauge, fixed by the length of the first base line.
@@ -14,8 +16,10 @@ Conventions, written here once:
 - The dtype follows the inputs; nothing here touches `jax.config`.
 """
 
-from jaxtri import segments as segments
-from jaxtri import tracker as tracker
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from jaxtri.compilation import capacity, keep_programs
 from jaxtri.errors import (
     CameraError,
     InitialisationError,
@@ -25,15 +29,15 @@ from jaxtri.errors import (
     TrajectoryError,
     TruncatedVideoError,
     TruncatedVideoWarning,
+    UnitsWarning,
     VideoError,
 )
 from jaxtri.estimation.bound import filtering_bound, smoothing_bound
 from jaxtri.estimation.two_view import TwoView, refine
-from jaxtri.filters import ekf as ekf
-from jaxtri.filters import schmidt as schmidt
-from jaxtri.filters.ekf import Diagnostics, Robust
-from jaxtri.filters.model import Belief
+from jaxtri.filters import ekf, schmidt
+from jaxtri.filters.ekf import Belief, Diagnostics, Robust
 from jaxtri.filters.scan import batch
+from jaxtri.formats.archive import load, save
 from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
 from jaxtri.models.base_frames import BaseFrames, BaseFramesState
 from jaxtri.models.base_pairs import BasePairs, BasePoint
@@ -41,12 +45,65 @@ from jaxtri.models.baselines.structure_and_motion import StructureAndMotion
 from jaxtri.models.baselines.two_step import TwoStep
 from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Kinematics, Twist
+from jaxtri.models.point_noise import PointNoise
 from jaxtri.models.trifocal import Trifocal, TrifocalState
-from jaxtri.tracker import Settings, Status
+from jaxtri.odometry import replay, single_pair, track_pairs
+from jaxtri.odometry.replay import Recording
+from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
 from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relative_errors
 
+if TYPE_CHECKING:
+    from jaxtri.estimation import tuning
+    from jaxtri.formats import read_camera, read_timestamps, read_trajectory, write_tum
+    from jaxtri.odometry.driver import Odometry
+    from jaxtri.odometry.poses import FramePose
+    from jaxtri.odometry.run import Run, follow_tracks, track, warm_up
+    from jaxtri.odometry.structure import Points
+    from jaxtri.output.plot import plot_trajectory
+    from jaxtri.output.results import write_overlay, write_results
+    from jaxtri.vision.klt import KLT, KLTSettings
+    from jaxtri.vision.video import open_source
+
+# Loaded when they are asked for: what they stand on, OpenCV above all, takes time and need not be there.
+_LATER = {
+    "FramePose": "jaxtri.odometry.poses",
+    "KLT": "jaxtri.vision.klt",
+    "KLTSettings": "jaxtri.vision.klt",
+    "Odometry": "jaxtri.odometry.driver",
+    "Points": "jaxtri.odometry.structure",
+    "Run": "jaxtri.odometry.run",
+    "follow_tracks": "jaxtri.odometry.run",
+    "open_source": "jaxtri.vision.video",
+    "plot_trajectory": "jaxtri.output.plot",
+    "read_camera": "jaxtri.formats",
+    "read_timestamps": "jaxtri.formats",
+    "read_trajectory": "jaxtri.formats",
+    "track": "jaxtri.odometry.run",
+    "tuning": "jaxtri.estimation",
+    "warm_up": "jaxtri.odometry.run",
+    "write_overlay": "jaxtri.output.results",
+    "write_results": "jaxtri.output.results",
+    "write_tum": "jaxtri.formats",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    place = _LATER[name]
+    found = import_module(f"{place}.{name}") if name == "tuning" else getattr(import_module(place), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 __all__ = [
+    "KLT",
     "Bank",
+    "Base",
     "BaseFrames",
     "BaseFramesState",
     "BasePairs",
@@ -58,13 +115,22 @@ __all__ = [
     "Depth",
     "Diagnostics",
     "Fisheye",
+    "FramePose",
     "InitialisationError",
     "InputError",
     "JaxtriError",
+    "KLTSettings",
     "Kinematics",
+    "Odometry",
+    "PointNoise",
+    "Points",
+    "Recording",
+    "Report",
     "ResolutionChangeError",
     "Robust",
+    "Run",
     "Settings",
+    "StartSettings",
     "Status",
     "StructureAndMotion",
     "Trajectory",
@@ -76,18 +142,36 @@ __all__ = [
     "Twist",
     "TwoStep",
     "TwoView",
+    "UnitsWarning",
     "VideoError",
     "align",
     "ate_rmse",
     "batch",
+    "capacity",
     "ekf",
     "evaluate",
     "filtering_bound",
+    "follow_tracks",
+    "keep_programs",
+    "load",
     "nees",
+    "open_source",
+    "plot_trajectory",
+    "read_camera",
+    "read_timestamps",
+    "read_trajectory",
     "refine",
     "relative_errors",
+    "replay",
+    "save",
     "schmidt",
-    "segments",
+    "single_pair",
     "smoothing_bound",
-    "tracker",
+    "track",
+    "track_pairs",
+    "tuning",
+    "warm_up",
+    "write_overlay",
+    "write_results",
+    "write_tum",
 ]

@@ -29,6 +29,10 @@ class TruncatedVideoWarning(UserWarning):
     """Fewer frames could be decoded than the source declares."""
 
 
+class UnitsWarning(UserWarning):
+    """What should be in normalised image units is clearly in pixels, or the other way round."""
+
+
 class TrajectoryError(InputError):
     """A trajectory file that cannot be parsed, or trajectories that cannot be compared."""
 

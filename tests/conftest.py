@@ -1,4 +1,6 @@
+import importlib
 import os
+import pkgutil
 from importlib.metadata import version
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -16,7 +18,11 @@ from jaxtyping import install_import_hook
 
 # The numeric tower: an int may stand where a float is asked for, as Python has it.
 with install_import_hook("jaxtri", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"):
-    import jaxtri  # noqa: F401
+    import jaxtri
+
+    # All of it: what is loaded later would not be checked.
+    for module in pkgutil.walk_packages(jaxtri.__path__, "jaxtri."):
+        importlib.import_module(module.name)
 
 import jax
 import pytest

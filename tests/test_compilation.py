@@ -9,7 +9,7 @@ import pytest
 
 from jaxtri.compilation import capacity
 from jaxtri.formats import read_camera
-from jaxtri.odometry import Odometry
+from jaxtri.odometry.driver import Odometry
 from jaxtri.vision.klt import KLT, KLTSettings
 from jaxtri.vision.video import open_source
 
@@ -61,8 +61,8 @@ def test_nothing_is_compiled_once_the_camera_is_followed():
         for frame, _ in zip(source, range(90), strict=False):
             tracks = klt.track(frame.image)
             before = len(compiled)
-            klt.drop(tracks.ids[odometry.add(tracks, frame.time_s)])
-            frames.append((odometry.segments, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
+            klt.drop(tracks.ids[odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)])
+            frames.append((odometry.starts, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
     segments, keyframes, programs, fresh = map(np.array, zip(*frames, strict=True))
     followed = np.flatnonzero(segments)[2:]
     assert keyframes[-1] > 5

@@ -1,8 +1,9 @@
 """Trajectory files: TUM, KITTI, EuRoC; read by what the first line looks like."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from jaxtri.errors import TrajectoryError
 from jaxtri.formats.files import PathLike, atomic_write, check_rows, read_rows, read_text
@@ -66,13 +67,13 @@ def read_kitti(path: PathLike, times: Float[np.ndarray, " t"] | None = None) -> 
 
 def write_tum(path: PathLike, trajectory: Trajectory, header: str = _TUM) -> None:
     """Write `timestamp tx ty tz qx qy qz qw`, after `header` as comment lines."""
-    q = Rotation.from_matrix(trajectory.rotations).as_quat(canonical=True)
+    q = _rotation().from_matrix(trajectory.rotations).as_quat(canonical=True)
     _write_rows(path, header, " ", "%.9f", trajectory.times, np.hstack([trajectory.positions, q]))
 
 
 def write_euroc(path: PathLike, trajectory: Trajectory, header: str = _EUROC) -> None:
     """Write `timestamp [ns], p xyz, q wxyz`, after `header` as comment lines."""
-    q = Rotation.from_matrix(trajectory.rotations).as_quat(canonical=True, scalar_first=True)
+    q = _rotation().from_matrix(trajectory.rotations).as_quat(canonical=True, scalar_first=True)
     nanoseconds = np.rint(trajectory.times * 1e9)
     _write_rows(path, header, ",", "%d", nanoseconds, np.hstack([trajectory.positions, q]))
 
@@ -92,10 +93,16 @@ def _trajectory(path, lines, times, positions, q) -> Trajectory:
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     check_rows(path, lines, np.abs(norm[:, 0] - 1) < 1e-2, "the quaternion is not of length 1", TrajectoryError)
     T = np.zeros((len(q), 4, 4))
-    T[:, :3, :3] = Rotation.from_quat(q).as_matrix()
+    T[:, :3, :3] = _rotation().from_quat(q).as_matrix()
     T[:, :3, 3] = positions
     T[:, 3, 3] = 1
     return Trajectory(times, T)
+
+
+def _rotation() -> Any:
+    from scipy.spatial.transform import Rotation  # here: a fifth of the time that importing the package takes
+
+    return Rotation
 
 
 def _write_rows(path, header, separator, first_format, first, rest) -> None:

@@ -264,6 +264,11 @@ def rotation_matrix(rotation: SO3 | Float[Array, "3"]) -> Float[Array, "3 3"]:
     return matrix(rotation) if isinstance(rotation, SO3) else matrix_from_euler(rotation)
 
 
+def identity(dtype: Any) -> SE3:
+    """The pose of the world itself, in a float type of the caller's: jaxlie's own is of the default one."""
+    return jax.tree.map(lambda x: x.astype(dtype), SE3.identity())
+
+
 def compose(rotation: SO3, translation: Float[Array, "3"]) -> SE3:
     """The pose of a rotation and a translation."""
     return SE3.from_rotation_and_translation(rotation, translation)

@@ -26,6 +26,7 @@ from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
 from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
 from jaxtri.filters.linalg import regression
+from jaxtri.filters.masks import select
 from jaxtri.filters.schmidt import ConsiderBelief, Measured
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.geometry.pose import local, retract, shear
@@ -287,7 +288,7 @@ def begin(
         jnp.zeros_like(p.slope).at[:, :, at[:3]].set(-back[:, :3]),
         jnp.broadcast_to(noise, p.noise.shape),
     )
-    points = jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, p)
+    points = select(fresh, new, p)
     mean = BaseFramesState(belief.mean.motion, belief.mean.bases, points)
     return ConsiderBelief(mean, belief.own, jnp.where(fresh[:, None], 0.0, belief.sensitivity))
 

@@ -19,6 +19,8 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
 from jaxtri.estimation.two_view import TwoView
+from jaxtri.filters.linalg import linearised
+from jaxtri.filters.masks import select
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 
 
@@ -106,7 +108,7 @@ class Depth(eqx.Module):
     ) -> Bank:
         """The bank with new points in the `fresh` slots, seen first at `pose`. Source: Yu et al. 2006, eq. 18."""
         new = self.plane(observed, pose, z_init, relative_sd)
-        return jax.tree.map(lambda a, b: jnp.where(fresh.reshape(-1, *([1] * (a.ndim - 1))), a, b), new, bank)
+        return select(fresh, new, bank)
 
     def step(
         self,
@@ -150,8 +152,7 @@ class Depth(eqx.Module):
 
             def linearise(x: Array) -> tuple[Array, Array, Array]:
                 """Innovation and Jacobian at x, and the inverse of the innovation's covariance."""
-                y, push = jax.linearize(lambda x: dehomogenise(camera(x)), x)
-                H = jax.vmap(push, out_axes=-1)(jnp.eye(3, dtype=x.dtype))
+                y, H = linearised(lambda x: dehomogenise(camera(x)), x)
                 return z - y - H @ (prior - x), H, _inverse_2x2(H @ C @ H.T + D)
 
             def gain(H: Array, inverse: Array) -> Array:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
+from jaxtri.filters.linalg import linearised
 from jaxtri.filters.model import Belief
 from jaxtri.filters.schmidt import Measured
 from jaxtri.geometry.epipolar import homogeneous, inverse_depth, perpendicular_line, safe_norm
@@ -152,9 +153,7 @@ class Trifocal(eqx.Module):
             mean_ = self.retract(mean, error)
             return jax.vmap(lambda pair: self._transfer(mean_, pair))(pairs)
 
-        zero = jnp.zeros(18, items.dtype)
-        y, push = jax.linearize(predicted, zero)
-        H = jax.vmap(push, out_axes=-1)(jnp.eye(18, dtype=items.dtype))
+        y, H = linearised(predicted, jnp.zeros(18, items.dtype))
         J = jax.vmap(jax.jacfwd(lambda pair: self._transfer(mean, pair)))(pairs)
         return Measured(y, H, J)
 

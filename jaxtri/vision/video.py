@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Thread
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ class Frame:
     image: UInt8[np.ndarray, "h w 3"]
 
 
+@runtime_checkable
 class _Reader(Protocol):
     declared: int | None
     fps: float | None

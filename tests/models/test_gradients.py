@@ -18,7 +18,6 @@ from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxtri import tracker
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf, schmidt
 from jaxtri.filters.linalg import regression
@@ -29,6 +28,7 @@ from jaxtri.models.baselines import structure_and_motion as sam
 from jaxtri.models.baselines import two_step
 from jaxtri.models.depth import Depth
 from jaxtri.models.trifocal import DEFAULT, PAPER, Trifocal
+from jaxtri.odometry import track_pairs
 
 N, FRAMES, SIGMA = 12, 6, 1e-3
 OUTLIER, ENDS, NEVER = 3, 5, 7  # points
@@ -191,12 +191,12 @@ def two_steps_planar(p, d):
 def per_track(p, d):
     weights = ekf.Robust(p["robust_start"], p["robust_scale"], p["gate"])
     settings = {k: v for k, v in p.items() if k not in ("robust_start", "robust_scale", "gate")}
-    settings = tracker.Settings(**settings, robust=weights)
+    settings = track_pairs.Settings(**settings, robust=weights)
     J = shear(d.view.translation)
     pose, C = compose(d.view.rotation, d.view.translation), J @ d.view.covariance @ J.T
-    state = tracker.init(settings, d.observed[0], d.observed[1], d.mask[1], pose, C, world=d.world, keyframes=4)
+    state = track_pairs.init(settings, d.observed[0], d.observed[1], d.mask[1], pose, C, world=d.world, keyframes=4)
     dt, mask = jnp.array([2.0, 1.0, 1.0, 1.0]), d.mask[2:]
-    state, report = tracker.filter(settings, state, d.observed[2:], mask, jnp.zeros_like(mask), dt)
+    state, report = track_pairs.filter(settings, state, d.observed[2:], mask, jnp.zeros_like(mask), dt)
     there = at(report, -1)
     return cost(report.diagnostics, there.pose, there.covariance) + of_bank(state.structure, d)
 

@@ -6,12 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtri.bases import StartSettings
 from jaxtri.formats import read_camera
-from jaxtri.odometry import Odometry
-from jaxtri.pipeline import track
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.run import track
+from jaxtri.odometry.settings import Settings, StartSettings
 from jaxtri.synthetic.rendered import write_laboratory
-from jaxtri.tracker import Settings
 from jaxtri.vision.klt import KLT, KLTSettings
 from jaxtri.vision.video import open_source
 
@@ -22,23 +21,24 @@ def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatc
     camera, klt = read_camera(tmp_path / "camera.json"), KLTSettings(capacity=100)
     settings = eqx.tree_at(lambda s: s.outlier, Settings.of(camera), jnp.asarray(0.03))  # gives up good points, too
     start = StartSettings(lag=4)  # the video is short
-    follower, odometry = KLT(klt), Odometry(camera, settings, start=start)
+    features, odometry = KLT(klt), Odometry(camera, settings, start=start, capacity=klt.capacity)
     outliers = [np.zeros(0, np.int64)] * 2
     with open_source(tmp_path) as source:
         for frame in source:
-            follower.drop(outliers[-2])
-            tracks = follower.track(frame.image)
+            features.drop(outliers[-2])
+            tracks = features.track(frame.image)
             tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers[-1]))
-            outliers.append(tracks.ids[odometry.add(tracks, frame.time_s)])
+            give_up = odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)
+            outliers.append(tracks.ids[give_up])
     odometry.finish()
     assert sum(map(len, outliers)) > 10
-    assert odometry.segments == 1
+    assert odometry.starts == 1
 
     for owner, slow in (KLT, KLT.track), (Odometry, Odometry.add):
 
-        def late(self, *arguments, slow=slow):
+        def late(self, *arguments, slow=slow, **more):
             time.sleep(0.02)
-            return slow(self, *arguments)
+            return slow(self, *arguments, **more)
 
         with monkeypatch.context() as patch, open_source(tmp_path) as source:
             patch.setattr(owner, slow.__name__, late)

@@ -8,21 +8,21 @@ import pytest
 from jaxlie import SE3, SO3
 from scipy.spatial.transform import Rotation
 
-from jaxtri import segments, tracker
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import compose, exp_pose, local, log_pose, multiply, relative, retract
 from jaxtri.models.point_noise import PointNoise
-from jaxtri.tracker import Settings, Status
+from jaxtri.odometry import single_pair, track_pairs
+from jaxtri.odometry.settings import Settings, Status
 
 N, FRAMES, SECOND = 64, 25, 5  # slots, frames, the second base frame
 CAMERA = Camera.from_parameters(500, 500, 320, 240, width=640, height=480)
 SETTINGS = Settings.of(CAMERA)
 PRECISE = Settings.of(CAMERA, noise_px=0.02)  # the motion model's pull on the pose goes with the square
 
-init = jax.jit(partial(tracker.init, keyframes=8))
-step = jax.jit(tracker.step)
-segment_init, segment_step = jax.jit(segments.init), jax.jit(segments.step)
+init = jax.jit(partial(track_pairs.init, keyframes=8))
+step = jax.jit(track_pairs.step)
+segment_init, segment_step = jax.jit(single_pair.init), jax.jit(single_pair.step)
 
 
 class Scene:
@@ -149,7 +149,7 @@ def test_scan_is_a_loop_of_step_and_its_derivative_is_finite(noisy):
 
     def run(sigma):
         settings = eqx.tree_at(lambda s: s.sigma, SETTINGS, sigma)
-        _, found = tracker.filter(settings, middle, *frames)
+        _, found = track_pairs.filter(settings, middle, *frames)
         return found.pose.wxyz_xyz[-1, 4:], found
 
     with_slope = jax.jit(lambda sigma: jax.jvp(run, (sigma,), (jnp.ones_like(sigma),), has_aux=True))
@@ -201,7 +201,7 @@ def test_tracks_that_jump_are_given_up_and_the_pose_stays_right(noisy):
 def test_float32_stays_float32():
     single = jax.tree.map(lambda x: x.astype(jnp.float32), SETTINGS)
     state = jax.eval_shape(lambda: Scene().begin(jnp.float32))
-    new, report = jax.eval_shape(tracker.step, single, state, *Scene().frame(6, jnp.float32))
+    new, report = jax.eval_shape(track_pairs.step, single, state, *Scene().frame(6, jnp.float32))
     assert jax.tree.map(lambda x: x.dtype, new) == jax.tree.map(lambda x: x.dtype, state)
     assert report.pose.wxyz_xyz.dtype == report.covariance.dtype == jnp.float32
 
@@ -216,7 +216,7 @@ class TestSegments:
         two_view = TwoView(T, pose.rotation(), known, jnp.ones(()), jnp.asarray(True))
         two_view = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), two_view)
         ends = (scene.frame(k, dtype)[0] for k in (0, SECOND))
-        settings, origin = jax.tree.map(lambda x: x.astype(dtype), SETTINGS), segments.origin(jnp.dtype(dtype))
+        settings, origin = jax.tree.map(lambda x: x.astype(dtype), SETTINGS), single_pair.origin(jnp.dtype(dtype))
         return segment_init(settings, *ends, jnp.ones(N, bool), two_view, origin, jnp.asarray(SECOND, dtype))
 
     @pytest.fixture(scope="class")
@@ -238,16 +238,16 @@ class TestSegments:
     def test_float32_is_float32(self):
         single = partial(jax.tree.map, lambda x: x if x.dtype == bool else x.astype(jnp.float32))
         state = jax.eval_shape(lambda: self.begin(Scene(), dtype=jnp.float32))
-        new, report = jax.eval_shape(segments.step, single(SETTINGS), state, *Scene().frame(6, jnp.float32))
+        new, report = jax.eval_shape(single_pair.step, single(SETTINGS), state, *Scene().frame(6, jnp.float32))
         assert jax.tree.map(lambda x: x.dtype, new) == jax.tree.map(lambda x: x.dtype, state)
         assert report.covariance.dtype == report.pose.wxyz_xyz.dtype == jnp.float32
 
     def test_covariance_of_the_world_pose(self, state):
         rng = np.random.default_rng(0)
         A, B = rng.normal(size=(7, 7)), rng.normal(size=(18, 18))
-        placed = segments.Placement(exp_pose(jnp.asarray(rng.normal(size=6))), jnp.asarray(A @ A.T))
+        placed = single_pair.Placement(exp_pose(jnp.asarray(rng.normal(size=6))), jnp.asarray(A @ A.T))
         belief = eqx.tree_at(lambda b: b.covariance, state.belief, jnp.asarray(B @ B.T))
-        pose, covariance = segments.world_pose(state._replace(belief=belief, placement=placed))
+        pose, covariance = single_pair.world_pose(state._replace(belief=belief, placement=placed))
 
         @jax.jit
         def moved(e):
@@ -264,7 +264,7 @@ class TestSegments:
 
     def test_depths_and_their_precision(self, state):
         scene = Scene()
-        depths = jax.jit(segments.depths)
+        depths = jax.jit(single_pair.depths)
         view = relative(scene.pose(0), scene.pose(3))
         value, sd = depths(state, view)
         expected = (scene.points[0] @ scene.R[3].T + scene.T[3])[:, 2]
@@ -277,7 +277,7 @@ class TestSegments:
 
     def test_common_scale_survives_outliers(self):
         rng, n = np.random.default_rng(0), 101
-        common_scale = jax.jit(segments.common_scale)
+        common_scale = jax.jit(single_pair.common_scale)
         after, sds, sigma = rng.uniform(2, 6, n), rng.uniform(5, 20, (2, n)), 1e-3
         true = 1.7
         found = []

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Float, Int
 
+from jaxtri.geometry.pose import identity
+
 
 class Keyframes(NamedTuple):
     """A ring of k poses, the newest overwriting the oldest, with the joint covariance of their errors."""
@@ -30,7 +32,7 @@ class Keyframes(NamedTuple):
 def start(one: SE3, two: SE3, covariance: Float[Array, "6 6"], k: int) -> Keyframes:
     """The first two keyframes: `one` is the gauge, `two` has the given covariance relative to it."""
     dtype = covariance.dtype
-    empty = jax.tree.map(lambda x: jnp.broadcast_to(x.astype(dtype), (k, *x.shape)), SE3.identity())
+    empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), identity(dtype))
     poses = jax.tree.map(lambda e, a, b: e.at[0].set(a).at[1].set(b), empty, one, two)
     joint = jnp.zeros((6 * k, 6 * k), dtype).at[6:12, 6:12].set(covariance)
     return Keyframes(poses, jnp.asarray(2, jnp.int32), joint)

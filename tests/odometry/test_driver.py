@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from tracks import CAPACITY, make, sideways
 
-from jaxtri import bases
-from jaxtri.bases import Base, StartSettings
 from jaxtri.errors import InitialisationError, InputError
-from jaxtri.odometry import Odometry
-from jaxtri.pipeline import follow_tracks
-from jaxtri.tracker import Settings, Status
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.run import follow_tracks
+from jaxtri.odometry.settings import Base, Settings, StartSettings, Status
+from jaxtri.odometry.start import Start, step_tracks
 from jaxtri.trajectory import Trajectory, evaluate
 
 
@@ -29,7 +28,7 @@ def test_every_kind_of_base_recovers_the_trajectory(base):
     assert found.ate_percent < limit
     assert found.rotation_rmse_deg < limit / 2
     assert [p.status for p in odometry.poses] == [Status.TRACKING] * 40
-    assert odometry.segments == 1
+    assert odometry.starts == 1
     assert odometry.scale_unknown_from is None
 
 
@@ -74,22 +73,12 @@ def test_single_pairs_restart_and_keep_the_scale():
         ids[again, n] += CAPACITY
     for base in (Base.INHERIT, Base.PAPER):
         odometry = Odometry(tracks.camera, base=base)
-        before = np.full(CAPACITY, -1)
         for k in range(70):
-            fresh = visible[k] & (ids[k] != before)
-            before = np.where(visible[k], ids[k], -1)
-            odometry.add(bases_tracks(pixels[k], visible[k], fresh, ids[k]), float(k))
+            odometry.add(pixels[k], visible[k], float(k), ids=ids[k])
         assert odometry.changes >= 1
-        assert odometry.segments == 1
+        assert odometry.starts == 1
         found = errors(tracks, odometry)
         assert found.ate_percent < 3
-
-
-def bases_tracks(pixels, visible, fresh, ids):
-    from jaxtri.vision.klt import FrameTracks
-
-    unknown = np.full(len(ids), np.nan)
-    return FrameTracks(pixels, visible, fresh, ids, unknown, unknown)
 
 
 def test_frames_before_the_first_motion_are_filled_in():
@@ -149,11 +138,8 @@ def covered(**start) -> Odometry:
     visible[20:24] = False  # the lens is covered for a while
     ids = np.repeat(np.arange(2), [20, 45])[:, None] * CAPACITY + np.arange(CAPACITY)
     odometry = Odometry(first.camera, start=StartSettings.of(Base.TRACKS, **start), record=True)
-    before = np.full(CAPACITY, -1)
     for k in range(65):
-        fresh = visible[k] & (ids[k] != before)
-        before = np.where(visible[k], ids[k], -1)
-        odometry.add(bases_tracks(pixels[k], visible[k], fresh, ids[k]), float(k))
+        odometry.add(pixels[k], visible[k], float(k), ids=ids[k])
     odometry.finish()
     return odometry
 
@@ -165,7 +151,7 @@ def test_a_complete_loss_starts_anew_and_says_that_the_scale_is_unknown():
     assert status[20:24] == [Status.LOST] * 4
     assert status[24] is Status.RESTARTED
     assert status[25:] == [Status.TRACKING] * 40
-    assert odometry.segments == 2
+    assert odometry.starts == 2
     assert odometry.scale_unknown_from == 24
     assert np.isfinite(odometry.trajectory().T_world_camera).all()
 
@@ -184,7 +170,7 @@ def test_an_error_while_a_start_is_worked_out_is_raised(monkeypatch):
     def fail(*_):
         raise MemoryError("no room")
 
-    monkeypatch.setattr("jaxtri.odometry.find", fail)
+    monkeypatch.setattr("jaxtri.odometry.driver.find", fail)
     tracks = sideways(20)
     with pytest.raises(MemoryError, match="no room"):
         follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
@@ -196,9 +182,9 @@ def test_a_start_is_worked_out_as_its_caller_has_set_jax(monkeypatch):
 
     def find(*_):
         seen.append((jax.enable_x64.value, jax.default_device.value))
-        return bases.Start(None, "not now")
+        return Start(None, "not now")
 
-    monkeypatch.setattr("jaxtri.odometry.find", find)
+    monkeypatch.setattr("jaxtri.odometry.driver.find", find)
     tracks, device = sideways(20), jax.devices("cpu")[0]
     with jax.enable_x64(False), jax.default_device(device):
         follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
@@ -223,11 +209,11 @@ def test_frames_that_make_no_sense_are_coasted_over():
 def test_a_changing_number_of_features_never_recompiles():
     tracks = sideways(30)
     follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
-    compiled = bases._step._cache_size()
+    compiled = step_tracks._cache_size()
     rng = np.random.default_rng(0)
     visible = np.logical_and.accumulate(tracks.visible & (rng.random(tracks.visible.shape) < 0.97), axis=0)
     follow_tracks(tracks.camera, tracks.pixels, visible)
-    assert bases._step._cache_size() == compiled
+    assert step_tracks._cache_size() == compiled
 
 
 def test_the_paper_start_overlaps_as_asked():

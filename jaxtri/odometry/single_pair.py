@@ -3,7 +3,7 @@
 The filter of a segment is the 18-state one of `jaxtri.models.trifocal`, with the second base pose in the
 state. A segment stands in the world by the pose of its first base frame and the logarithm of its scale, both
 with their covariance. `init` and `step` are pure, on arrays of fixed capacity, like those of
-`jaxtri.tracker`; when to restart is the driver's business.
+`jaxtri.track_pairs`; when to restart is the driver's business.
 """
 
 from typing import NamedTuple
@@ -16,10 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtri.estimation.two_view import TwoView, refine, scaled
 from jaxtri.filters import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
-from jaxtri.geometry.pose import adjoint, multiply, relative, shear
+from jaxtri.geometry.pose import adjoint, identity, multiply, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
-from jaxtri.tracker import Report, Settings, Status, judge, median, noise_scale, structure_model
+from jaxtri.odometry.measuring import measure, median, noise_scale, structure_model
+from jaxtri.odometry.settings import Report, Settings, Status
 
 
 class Placement(NamedTuple):
@@ -44,8 +45,7 @@ class State(NamedTuple):
 
 def origin(dtype: jnp.dtype) -> Placement:
     """The placement of the first segment: the world itself, its scale the gauge."""
-    identity = jax.tree.map(lambda x: x.astype(dtype), SE3.identity())
-    return Placement(identity, jnp.zeros((7, 7), dtype))
+    return Placement(identity(dtype), jnp.zeros((7, 7), dtype))
 
 
 def _model(settings: Settings, epipole: Float[Array, "3"], depth: Float[Array, ""]) -> Trifocal:
@@ -111,26 +111,15 @@ def step(
     """One frame: predict, and update with the tracks of the base pair that are still there."""
     inside = state.inside & visible & ~fresh
     model = _model(settings, state.epipole, state.depth)
-    predicted = ekf.predict(model, state.belief, dt)
-    scale = noise_scale(settings, quality)
-    updated, diagnostics = ekf.update(
-        model,
-        predicted,
-        state.pairs,
-        observed,
-        inside,
-        passes=settings.passes,
-        robust=settings.robust,
-        noise_scale=scale,
-    )
-    belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, inside, state.coasted)
-    drop = ok & inside & (diagnostics.distance > settings.outlier)
+    scale, dt = noise_scale(settings, quality), jnp.asarray(dt, observed.dtype)
+    found = measure(settings, model, state.belief, state.pairs, observed, inside, dt, state.coasted, scale)
+    ok, drop = found.taken, found.drop
     inside = inside & ~drop
-    new = state._replace(belief=belief, inside=inside, coasted=coasted)
+    new = state._replace(belief=found.belief, inside=inside, coasted=found.coasted)
     pose, covariance = world_pose(new)
     structure = structure_model(settings).step(state.structure, pose, observed, inside & ok, own_covariance(new), dt)
     new = new._replace(structure=structure)
-    return new, Report(pose, covariance, status, jnp.asarray(False), drop, diagnostics)
+    return new, Report(pose, covariance, found.status, jnp.asarray(False), drop, found.diagnostics)
 
 
 def depths(state: State, view: SE3) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -6,7 +6,7 @@ from jaxlie import SO3
 
 from jaxtri.errors import InputError
 from jaxtri.geometry.camera import BrownConrady, Camera
-from jaxtri.vision.overlay import Wireframe, car, dominant_plane, draw_text, draw_tracks, draw_wireframe, place
+from jaxtri.output.overlay import Wireframe, car, dominant_plane, draw_text, draw_tracks, draw_wireframe, place
 
 SIZE = {"width": 320, "height": 240}
 PINHOLE = Camera.from_parameters(250, 260, 158, 121, **SIZE)

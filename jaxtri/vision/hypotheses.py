@@ -9,6 +9,7 @@ import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.errors import JaxtriError
 from jaxtri.estimation import two_view
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 
@@ -49,11 +50,14 @@ def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_p
 
 
 def poselib_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:
-    """The relative pose (R, T) by PoseLib's LO-RANSAC, where it is installed (extra `init`); else empty."""
+    """The relative pose (R, T) by PoseLib's LO-RANSAC; empty where it finds none.
+
+    Raises `JaxtriError` where PoseLib is not installed (extra `init`).
+    """
     try:
         import poselib  # pyright: ignore[reportMissingImports]
     except ImportError:
-        return []
+        raise JaxtriError("starts by PoseLib need it: python -m pip install 'jaxtri[init]'") from None
     # In pixels of a focal length of 1000: PoseLib's refinement is scaled for pixels.
     camera = {"model": "PINHOLE", "width": 2000, "height": 2000, "params": [1000.0, 1000.0, 0.0, 0.0]}
     options = {"max_epipolar_error": 1000 * threshold}
@@ -146,20 +150,21 @@ def hypotheses(
     threshold: float,
     *,
     eight_point: bool = False,
+    poselib: bool = False,
 ) -> list[Hypothesis]:
     """Relative poses that may explain two views, refined, different from each other, the best first.
 
     `u1`, `u2` (n, 2) are normalised points in slots with noise `sigma`, `mask` (n,) those seen in both;
     `threshold` is that of the robust estimators. Essential matrices and the decomposition of a homography
     compete, so that a plane (which has two poses) and a general scene are both served; with `eight_point`
-    only the paper's way. Empty where nothing fits.
+    only the paper's way; with `poselib` PoseLib's pose competes, too. Empty where nothing fits.
     """
     a, b = u1[mask].astype(np.float64), u2[mask].astype(np.float64)
     if len(a) < 8:
         return []
     poses = essential_poses(a, b, threshold, eight_point=eight_point)
     if not eight_point:
-        poses += poselib_poses(a, b, threshold) + homography_poses(a, b, threshold)
+        poses += (poselib_poses(a, b, threshold) if poselib else []) + homography_poses(a, b, threshold)
     if not poses:
         return []
     wanted = np.arange(HYPOTHESES) < len(poses)

@@ -8,86 +8,25 @@ Beside the pose runs the structure bank (`jaxtri.models.depth`): a point per tra
 begins, refined in every frame given the pose, and kept as it was when the track ends.
 """
 
-from enum import IntEnum
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri.filters import ekf, projective
-from jaxtri.filters.masks import replace_masked, stand_in
+from jaxtri.filters.masks import replace_masked, select, stand_in
 from jaxtri.filters.model import transition
 from jaxtri.filters.scan import checkpointed
-from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
-from jaxtri.geometry.pose import multiply, relative
-from jaxtri.keyframes import Keyframes, add, carry, start, total
+from jaxtri.geometry.pose import identity, multiply, relative
 from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_point
-from jaxtri.models.depth import Bank, Depth
+from jaxtri.models.depth import Bank
 from jaxtri.models.motion import Twist
-from jaxtri.models.point_noise import PointNoise
-
-
-class Status(IntEnum):
-    """What a pose is worth."""
-
-    INITIALISING = 0  # no pose yet: not enough parallax so far
-    TRACKING = 1
-    COASTING = 2  # predicted only: too few points agreed
-    RESTARTED = 3  # the first frame of a new start; its scale is unknown unless said otherwise
-    LOST = 4  # no pose
-
-
-class Settings(eqx.Module):
-    """What a tracker run may tune; lengths in normalised image units, angles in radians, times in frames.
-
-    `Settings.of(camera)` fills them from pixels.
-    """
-
-    sigma: Float[Array, ""]  # noise of an image point
-    acceleration: Float[Array, ""]  # of the camera, in median scene depths per frame^2
-    angular_acceleration: Float[Array, ""]  # per frame^2
-    keyframe_flow: Float[Array, ""]  # median flow since the last keyframe that makes a new one
-    keyframe_common: Float[Array, ""]  # ... or fewer common tracks than this
-    keyframe_usable: Float[Array, ""]  # ... or a smaller share of usable ones than this
-    usable_parallax: Float[Array, ""]  # angle from which a base pair may measure
-    fixed_parallax: Float[Array, ""]  # angle from which a base pair stays
-    epipolar_gate: Float[Array, ""]  # largest Sampson distance of a base pair
-    outlier: Float[Array, ""]  # squared Mahalanobis distance above which a track is given up
-    minimum: Float[Array, ""]  # fewest agreeing points of a pose
-    patience: Float[Array, ""]  # frames of coasting after which the camera is lost
-    robust: ekf.Robust
-    point_noise: PointNoise | None = None  # of a point over sigma
-    passes: int = eqx.field(static=True, default=8)
-
-    @classmethod
-    def of(cls, camera: Camera, *, noise_px: Float[Array, ""] | float = 0.4, passes: int = 8) -> "Settings":
-        """The defaults, for a camera whose tracks have `noise_px` of noise in each coordinate."""
-        focal = jnp.sqrt(camera.fx * camera.fy)
-        width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
-
-        def number(x: float) -> Array:
-            return jnp.asarray(x, focal.dtype)
-
-        return cls(
-            sigma=noise_px / focal,
-            acceleration=number(0.02),
-            angular_acceleration=number(0.02),
-            keyframe_flow=0.035 * width / focal,
-            keyframe_common=number(20),
-            keyframe_usable=number(0.3),
-            usable_parallax=jnp.deg2rad(number(0.3)),
-            fixed_parallax=jnp.deg2rad(number(1.5)),
-            epipolar_gate=1.5 / focal,
-            outlier=number(30.0),
-            minimum=number(8),
-            patience=number(15),
-            robust=ekf.Robust(number(1e4), number(16.0), number(13.8)),
-            passes=passes,
-        )
+from jaxtri.odometry.keyframes import Keyframes, add, carry, start, total
+from jaxtri.odometry.measuring import measure, median, noise_scale, structure_model
+from jaxtri.odometry.settings import Report, Settings
 
 
 class Tracks(NamedTuple):
@@ -116,27 +55,6 @@ class State(NamedTuple):
     born: Bool[Array, " n"]  # tracks whose point stands in `structure`
 
 
-class Report(NamedTuple):
-    """What a step says of its frame."""
-
-    pose: SE3  # world to camera
-    covariance: Float[Array, "6 6"]  # of its error exp(delta) T, (linear, angular) in camera axes, drift included
-    status: Int[Array, ""]
-    keyframe: Bool[Array, ""]
-    drop: Bool[Array, " n"]  # tracks that are outliers: their slots may be filled anew
-    diagnostics: ekf.Diagnostics
-
-
-def structure_model(settings: Settings) -> Depth:
-    """The filters of the points, which are gated as the pose's are."""
-    return Depth.of(settings.sigma, gate=settings.robust.gate)
-
-
-def noise_scale(settings: Settings, quality: Float[Array, "n 2"] | None) -> Float[Array, " n"] | None:
-    """Noise of each point over sigma, where the settings have a model of it."""
-    return None if quality is None or settings.point_noise is None else settings.point_noise.scale(quality)
-
-
 def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
     return BasePairs(settings.sigma, settings.acceleration * depth, settings.angular_acceleration)
 
@@ -159,8 +77,7 @@ def init(
     The frames between the two, and the second, follow by `step` with `hold=True`.
     """
     dtype = first.dtype
-    one = SE3.identity() if world is None else world
-    one = jax.tree.map(lambda x: x.astype(dtype), one)
+    one = identity(dtype) if world is None else jax.tree.map(lambda x: x.astype(dtype), world)
     two = multiply(pose, one)
     first = jnp.where(mask[:, None], first, jnp.zeros((), dtype))
     second = jnp.where(mask[:, None], second, jnp.zeros((), dtype))
@@ -177,35 +94,6 @@ def init(
     sensitivity = jnp.zeros((12, 6 * keyframes), dtype)
     structure = structure_model(settings).plane(first, one, depth)
     return State(belief, tracks, kept, sensitivity, second, mask, depth, jnp.asarray(0, jnp.int32), structure, mask)
-
-
-def judge(
-    settings: Settings,
-    updated: ekf.Belief,
-    predicted: ekf.Belief,
-    diagnostics: ekf.Diagnostics,
-    mask: Bool[Array, " n"],
-    coasted: Int[Array, ""],
-) -> tuple[ekf.Belief, Bool[Array, ""], Int[Array, ""], Int[Array, ""]]:
-    """The belief to go on with: the update where enough points agree, else the prediction, and the status.
-
-    Also whether the update stands, and the frames coasted since the last that did.
-    """
-    count = jnp.sum(mask).astype(settings.minimum.dtype)
-    ok = diagnostics.used >= jnp.maximum(settings.minimum, 0.25 * count)
-    belief = jax.tree.map(lambda a, b: jnp.where(ok, a, b), updated, predicted)
-    coasted = jnp.where(ok, 0, coasted + 1)
-    # Tracks do not come back: with too few of them left no later frame can agree either.
-    lost = (coasted > settings.patience) | (count < settings.minimum)
-    status = jnp.where(ok, Status.TRACKING, jnp.where(lost, Status.LOST, Status.COASTING)).astype(jnp.int32)
-    return belief, ok, coasted, status
-
-
-def median(x: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Median of the unmasked entries; 1 where there is none."""
-    ordered = jnp.sort(jnp.where(mask, x, jnp.inf))
-    count = jnp.sum(mask)
-    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], jnp.ones((), x.dtype))
 
 
 def _pair(
@@ -235,15 +123,12 @@ def _rebase(settings: Settings, state: State, observed: Array, visible: Array) -
     )
     better = waiting & good & (angle > settings.usable_parallax)
 
-    def choose(new: Array, old: Array) -> Array:
-        return jnp.where(better.reshape(-1, *([1] * (new.ndim - 1))), new, old)
-
     begins = visible & (slots[:, 0] < 0) & ~tracks.fixed
     moved = Tracks(
         jnp.where(begins[:, None], observed, tracks.first),
         jnp.stack([jnp.where(begins, slot, slots[:, 0]), jnp.where(better, slot, slots[:, 1])], axis=-1),
-        jax.tree.map(choose, base, tracks.base),
-        choose(lever, tracks.lever),
+        select(better, base, tracks.base),
+        select(better, lever, tracks.lever),
         tracks.usable & ~begins | better,
         tracks.fixed | (better & (angle > settings.fixed_parallax)),
     )
@@ -272,17 +157,12 @@ def step(
     keep = visible & ~fresh
     tracks = _only(old, keep)
 
-    model = _model(settings, state.depth)
-    predicted = ekf.predict(model, state.belief, dt)
+    model, dt = _model(settings, state.depth), jnp.asarray(dt, observed.dtype)
     mask, scale = tracks.usable, noise_scale(settings, quality)
     items = projective.prepare(model, stand_in(mask, tracks.base))
-    updated, diagnostics = ekf.update(
-        model, predicted, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
-    )
-    dt = jnp.asarray(dt, observed.dtype)
-    belief, ok, coasted, status = judge(settings, updated, predicted, diagnostics, mask, state.coasted)
-    drop = ok & mask & (diagnostics.distance > settings.outlier)
-    weights = jnp.where(ok, diagnostics.weights, 0.0)
+    found = measure(settings, model, state.belief, items, observed, mask, dt, state.coasted, scale)
+    belief, ok, drop = found.belief, found.taken, found.drop
+    weights = jnp.where(ok, found.diagnostics.weights, 0.0)
     sensitivity = carry(
         state.sensitivity,
         transition(model, state.belief.mean, dt),
@@ -311,10 +191,10 @@ def step(
     depths = tracks.base.point[:, :3] @ belief.mean.pose.rotation().as_matrix()[2]
     depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
-    plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, coasted, structure, born)
+    plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, found.coasted, structure, born)
     new = jax.lax.cond(keyframe, lambda: _rebase(settings, plain, observed, visible), lambda: plain)
     covariance = total(belief.covariance[:6, :6], state.keyframes, sensitivity)
-    return new, Report(belief.mean.pose, covariance, status, keyframe, drop, diagnostics)
+    return new, Report(belief.mean.pose, covariance, found.status, keyframe, drop, found.diagnostics)
 
 
 def _owed(

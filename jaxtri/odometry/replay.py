@@ -15,32 +15,48 @@ import numpy as np
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri import segments, tracker
 from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters.scan import checkpointed
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import compose, shear
-from jaxtri.tracker import Report, Settings
+from jaxtri.odometry import single_pair, track_pairs
+from jaxtri.odometry.settings import Report, Settings
 
 
 class Recording(eqx.Module):
     """Feature tracks in slots, from the first base frame on, and the base pairs of all segments, in order.
 
     A single pair per run, as `tracks` needs it, is a recording of one segment. Frames count from the first one here.
+
+    Attributes:
+        pixels: (t, n, 2) image points.
+        visible: (t, n) which slots hold a track.
+        ids: (t, n) number of the track in each slot.
+        quality: (t, n, 2) forward-backward error in pixels and smaller eigenvalue of the patch; NaN where unknown.
+        dt: (t,) time since the frame before, in frames.
+        first: (s,) first frame of each base pair.
+        second: (s,) second frame of each base pair.
+        frames: (s, l) frames that each pair then measures, in order; -1 fills up.
+        translation: (s, 3) about the relative pose of each pair, of unit length.
+        rotation: (s,) the same of its rotation.
+        inside: (s, n) tracks that each relative pose is estimated from.
+        origin: Frame of the run that is frame 0 here: the first base frame.
+        inherit: Restarts take frames already tracked, else consecutive ones (static).
     """
 
     pixels: Float[Array, "t n 2"]
     visible: Bool[Array, "t n"]
-    ids: Int[Array, "t n"]  # of the track in each slot
-    quality: Float[Array, "t n 2"]  # forward-backward error in pixels, smaller eigenvalue; NaN where unknown
-    dt: Float[Array, " t"]  # time since the frame before, in frames
-    first: Int[Array, " s"]  # frames of each base pair
+    ids: Int[Array, "t n"]
+    quality: Float[Array, "t n 2"]
+    dt: Float[Array, " t"]
+    first: Int[Array, " s"]
     second: Int[Array, " s"]
-    frames: Int[Array, "s l"]  # that each pair then measures, in order; -1 fills up
-    translation: Float[Array, "s 3"]  # about the relative pose of each pair
+    frames: Int[Array, "s l"]
+    translation: Float[Array, "s 3"]
     rotation: SO3
-    inside: Bool[Array, "s n"]  # tracks that each relative pose is estimated from
-    inherit: bool = eqx.field(static=True, default=False)  # restarts take frames already tracked, else consecutive ones
+    inside: Bool[Array, "s n"]
+    origin: Int[Array, ""]
+    inherit: bool = eqx.field(static=True, default=False)
 
     def normalised(self, camera: Camera) -> Float[Array, "t n 2"]:
         """The points seen, normalised; where nothing is visible that of the first one that is."""
@@ -66,14 +82,14 @@ class Recording(eqx.Module):
 
 
 def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: int = 1) -> Report:
-    """The run of `jaxtri.tracker`, a base pair per track: reports of all frames after the first, (t - 1,)."""
+    """The run of `jaxtri.track_pairs`, a base pair per track: reports of all frames after the first, (t - 1,)."""
     u = recording.normalised(camera)
     view = recording.start(settings, u)
     ids, visible, second = recording.ids, recording.visible, recording.second[0]
     common = visible[0] & visible[second] & (ids[0] == ids[second])
     J = shear(view.translation)
     pose = compose(view.rotation, view.translation)
-    state = tracker.init(settings, u[0], u[second], common, pose, J @ view.covariance @ J.T)
+    state = track_pairs.init(settings, u[0], u[second], common, pose, J @ view.covariance @ J.T)
     # Up to the second base frame only the pair's tracks are measured; what else is there begins after it.
     at = jnp.arange(1, len(ids))[:, None]
     same = visible[:-1] & visible[1:] & (ids[1:] == ids[:-1])
@@ -82,11 +98,11 @@ def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: i
     seen = jnp.where(hold, common & visible[1:] & (ids[1:] == ids[0]), visible[1:])
     fresh = ~hold & seen & ~same
     frames = (u[1:], seen, fresh, recording.dt[1:])
-    return tracker.filter(settings, state, *frames, hold=hold[:, 0], quality=recording.quality[1:], block=block)[1]
+    return track_pairs.filter(settings, state, *frames, hold=hold[:, 0], quality=recording.quality[1:], block=block)[1]
 
 
 def pairs(camera: Camera, settings: Settings, recording: Recording, *, block: int = 1) -> Report:
-    """The run of `jaxtri.segments`, one base pair for all tracks: reports (s, l) of the frames of each segment.
+    """The run of `jaxtri.single_pair`, one base pair for all tracks: reports (s, l) of the frames of each segment.
 
     Where a segment is shorter the rest are empty: nothing measured, the last pose.
     """
@@ -96,14 +112,14 @@ def pairs(camera: Camera, settings: Settings, recording: Recording, *, block: in
     def common(a: Array, b: Array) -> Array:
         return visible[a] & visible[b] & (ids[a] == ids[b])
 
-    def begin(a: Array, b: Array, view: TwoView, placement: segments.Placement) -> segments.State:
-        return segments.init(settings, u[a], u[b], common(a, b), view, placement, (b - a).astype(dtype))
+    def begin(a: Array, b: Array, view: TwoView, placement: single_pair.Placement) -> single_pair.State:
+        return single_pair.init(settings, u[a], u[b], common(a, b), view, placement, (b - a).astype(dtype))
 
     def follow(carry: tuple, frame: Array) -> tuple[tuple, Report]:
         state, known, before = carry
         active = frame >= 0
         at = jnp.maximum(frame, 0)
-        new, report = segments.step(
+        new, report = single_pair.step(
             settings, state, u[at], visible[at], ids[at] != known, recording.dt[at], quality=recording.quality[at]
         )
         after, idle = (new, (report.pose, report.covariance)), (state, before)
@@ -115,7 +131,7 @@ def pairs(camera: Camera, settings: Settings, recording: Recording, *, block: in
     def segment(carry: tuple, k: Array) -> tuple[tuple, Report]:
         state, poses, covariances = carry
         b, frames = recording.second[k], recording.frames[k]
-        pose, covariance = segments.world_pose(state)
+        pose, covariance = single_pair.world_pose(state)
         (state, *_), reports = checkpointed(follow, (state, ids[b], (pose, covariance)), frames, block)
         frames = jnp.where(frames >= 0, frames, len(u))  # beyond the end nothing is written
         if not recording.inherit:
@@ -125,16 +141,16 @@ def pairs(camera: Camera, settings: Settings, recording: Recording, *, block: in
         # On to the next pair; after the last one its own once more, and nothing comes of it.
         k = jnp.minimum(k + 1, len(recording.first) - 1)
         a, b = recording.first[k], recording.second[k]
-        pair = segments.Pair(u[a], u[b], common(a, b), SE3(poses[a]).normalize(), covariances[a])
+        pair = single_pair.Pair(u[a], u[b], common(a, b), SE3(poses[a]).normalize(), covariances[a])
         if recording.inherit:
-            view, placement = segments.inherited(settings, state, pair)
+            view, placement = single_pair.inherited(settings, state, pair)
         else:
             guess = recording.translation[k], SO3(recording.rotation.wxyz[k])
             found = refine(*guess, u[a], u[b], recording.inside[k], settings.sigma)
-            view, placement, _ = segments.consecutive(settings, state, pair, found)
+            view, placement, _ = single_pair.consecutive(settings, state, pair, found)
         return (begin(a, b, view, placement), poses, covariances), reports
 
-    placement = segments.origin(dtype)
+    placement = single_pair.origin(dtype)
     state = begin(recording.first[0], recording.second[0], recording.start(settings, u), placement)
     poses = jnp.broadcast_to(placement.pose.parameters(), (len(u), 7))
     carry = (state, poses, jnp.zeros((len(u), 6, 6), dtype))

@@ -1,4 +1,5 @@
 import dataclasses
+import types
 
 import equinox as eqx
 import jax
@@ -7,16 +8,15 @@ import numpy as np
 import pytest
 from tracks import sideways
 
-from jaxtri import replay
-from jaxtri.bases import Base, StartSettings
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.filters.diagnostics import Diagnostics
 from jaxtri.filters.scan import checkpointed
 from jaxtri.geometry.camera import BrownConrady, Camera
 from jaxtri.models.point_noise import PointNoise
-from jaxtri.odometry import Odometry
-from jaxtri.pipeline import follow_tracks
-from jaxtri.tracker import Report, Settings
+from jaxtri.odometry import replay
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.run import follow_tracks
+from jaxtri.odometry.settings import Base, Settings, StartSettings
 
 TRACKS = sideways(16, seed=1)
 SETTINGS = Settings.of(TRACKS.camera, noise_px=0.3)
@@ -90,12 +90,13 @@ def test_likelihoods_are_those_of_pixels():
     rng = np.random.default_rng(0)
     pixels = jnp.asarray(rng.uniform(100, 400, (3, 5, 2)))
     _, recording = live(Base.TRACKS)
-    recording = dataclasses.replace(recording, pixels=pixels, visible=jnp.ones((3, 5), bool).at[1, 4].set(False))
+    visible = jnp.ones((3, 5), bool).at[1, 4].set(False)
+    recording = eqx.tree_at(lambda r: (r.pixels, r.visible), recording, (pixels, visible))
     weights = jnp.asarray([[1.0, 0.5, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.0, 1.0]])
     said = jax.vmap(Diagnostics)(
         jnp.asarray([30.0, 40.0]), jnp.zeros(2), jnp.asarray([4, 5]), jnp.asarray([3, 5]), weights, weights
     )
-    report = Report(None, None, None, None, None, said)
+    report = types.SimpleNamespace(diagnostics=said)
     jacobians = jax.vmap(jax.vmap(jax.jacrev(camera.to_normalised)))(pixels[1:])
     log_det = np.log(np.abs(np.linalg.det(jacobians)))[np.asarray(weights) > 0].sum()
     expected = -(70 + log_det - np.log(640 * 480)) / 18

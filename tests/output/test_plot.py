@@ -5,7 +5,7 @@ import pytest
 from jaxlie import SO3
 
 from jaxtri.geometry.pose import euler_from_matrix
-from jaxtri.plot import plot_trajectory
+from jaxtri.output.plot import plot_trajectory
 from jaxtri.trajectory import Trajectory
 
 NAMES = {0: "initialising", 1: "tracking", 2: "coasting"}

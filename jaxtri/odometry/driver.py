@@ -1,0 +1,394 @@
+"""A camera's trajectory from feature tracks, on the host: waiting for parallax, starting, following, starting anew.
+
+The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, and needs a decision, is here.
+"""
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxlie import SE3
+from jaxtyping import ArrayLike
+
+from jaxtri.checks import booleans, numbers
+from jaxtri.compilation import capacity
+from jaxtri.errors import InitialisationError, InputError
+from jaxtri.estimation.two_view import scaled
+from jaxtri.formats.archive import Archived
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.pose import identity
+from jaxtri.odometry.followers import Follower, SinglePair, TrackPairs
+from jaxtri.odometry.poses import FramePose, pose_matrix, trajectory
+from jaxtri.odometry.recorder import Recorder
+from jaxtri.odometry.replay import Recording
+from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
+from jaxtri.odometry.slots import Slotted, slotted
+from jaxtri.odometry.start import BasePair, Observations, fill, find, hold
+from jaxtri.odometry.structure import Points, no_points
+from jaxtri.trajectory import Trajectory
+
+CATCH_UP = 2  # frames taken in for each that comes, where some came while a start was worked out
+AGAIN = 1.1  # flow, over that of the last attempt, from which a start from the same first frame is tried again
+
+_normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
+
+
+class _Begun(NamedTuple):
+    """A start: its base pair, the filter that goes on from it, and the poses of the frames that waited for it."""
+
+    pair: BasePair
+    follower: Follower
+    poses: dict[int, FramePose]
+
+
+@dataclass
+class Odometry(Archived):
+    """Feeds feature tracks, frame by frame, to the recursive filters and collects what they say.
+
+    `add` takes the frames in order and returns the tracks to give up. While the camera has not moved enough
+    the frames wait with the status INITIALISING; they are filled in when the first base pair stands. After a
+    complete loss a new start follows, whose scale is unknown: it is set so that the scene is as deep as it
+    was, and `scale_unknown_from` names the frame from which this is a guess.
+
+    A start takes as long as many frames, so it is worked out by a thread while the next `StartSettings.lag`
+    frames queue up; what comes out of given tracks does not depend on that. `finish` takes in what is queued.
+    `save` and `load` keep all of it in a file, also while a start is being worked out, and go on as if never stopped.
+
+    Attributes:
+        camera: Intrinsics, with the width of the image in pixels.
+        settings: What the filters may tune; `Settings.of(camera)` by default.
+        base: Which two base frames a track is measured from; a `Base` or its name.
+        start: When a base pair is good enough; `StartSettings.of(base)` by default.
+        frame_time: Seconds of one frame, the unit of time of the filters; the first interval by default.
+        record: Keep the tracks, for `recording`.
+        capacity: Most tracks that are followed at once; by default the least of 64, 128, 256, ... that holds the rows
+            of the first frame. Filters are compiled once for each.
+        poses: One `FramePose` a frame.
+        base_pair: Frames of the first start, None before it.
+        starts: Starts so far; more than one means that the camera was lost.
+        scale_unknown_from: Frame from which the scale is a guess, None where there is none.
+        reason: Why there is no start yet.
+    """
+
+    camera: Camera
+    settings: Settings | None = None
+    base: Base | str = Base.TRACKS
+    start: StartSettings | None = None
+    frame_time: float | None = None
+    record: bool = False
+    capacity: int | None = None
+
+    poses: list[FramePose] = field(default_factory=list, init=False)
+    base_pair: tuple[int, int] | None = field(default=None, init=False)
+    starts: int = field(default=0, init=False)
+    scale_unknown_from: int | None = field(default=None, init=False)
+    reason: str = field(default="no frames yet", init=False)
+
+    _held: np.ndarray | None = field(default=None, init=False, repr=False)  # (capacity,) tracks in the slots
+    _waiting: list[Observations] = field(default_factory=list, init=False, repr=False)  # may still become a base pair
+    _passed: list[Observations] = field(default_factory=list, init=False, repr=False)  # no longer can
+    _queue: list[Observations] = field(default_factory=list, init=False, repr=False)  # are not taken in yet
+    _seeking: bool = field(default=False, init=False, repr=False)  # a base pair: the first and last of those waiting
+    _search: Future[_Begun | str] | None = field(default=None, init=False, repr=False, metadata={"saved": False})
+    _follower: Follower | None = field(default=None, init=False, repr=False)
+    _points: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+    _tried: tuple[int, float] = field(default=(-1, 0.0), init=False, repr=False)  # first frame and flow of an attempt
+    _depth: float = field(default=1.0, init=False, repr=False)
+    _changes: int = field(default=0, init=False, repr=False)
+    _recorder: Recorder = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.camera.width is None:
+            raise InputError("the camera has no image width: set it, the thresholds of the tracker scale with it")
+        if self.capacity is not None and self.capacity < 1:
+            raise InputError(f"capacity is {self.capacity}; give the most tracks that are followed at once, or None")
+        self.base = Base(self.base)
+        self.settings = self.settings or Settings.of(self.camera)
+        self.start = self.start or StartSettings.of(self.base)
+        self._recorder = Recorder(self.record)
+
+    @property
+    def _settings(self) -> Settings:
+        assert self.settings is not None
+        return self.settings
+
+    @property
+    def _start(self) -> StartSettings:
+        assert self.start is not None
+        return self.start
+
+    def add(
+        self,
+        pixels: ArrayLike,
+        visible: ArrayLike,
+        time: float,
+        *,
+        ids: ArrayLike | None = None,
+        quality: ArrayLike | None = None,
+    ) -> np.ndarray:
+        """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
+
+        `pixels` (n, 2) are image points, `visible` (n,) says which rows hold one; what is not finite is not visible.
+        `ids` (n,) are the numbers of the tracks, not negative: rows may come in any order and number. Without, a row
+        is a track in every frame. `time` is in seconds. `quality` (n, 2) are the forward-backward errors in
+        pixels and the smaller eigenvalues of the patches, for `Settings.point_noise`.
+
+        Raises `InputError`, and takes nothing, where an array has another shape, the time does not increase, two
+        visible rows have one number, or there are more of them than `capacity`.
+        """
+        index = len(self.poses)
+        frame, tracks, ids = self._observe(index, pixels, visible, time, ids, quality)
+        if self.frame_time is None and self.poses:
+            self.frame_time = frame.time - self.poses[-1].time
+        self._held = tracks.ids
+        self._recorder.take(tracks)
+        self.poses.append(FramePose(frame.time, Status.LOST if self.starts else Status.INITIALISING))
+        self._queue.append(frame)
+        return np.isin(ids, self._take_in(index, CATCH_UP))
+
+    def finish(self) -> None:
+        """Take in the frames that came while a start was worked out, which is waited for."""
+        self._take_in(math.inf, math.inf)
+
+    @property
+    def latest(self) -> FramePose | None:
+        """The newest frame that has been taken in, with its pose, covariance and status; None before the first.
+
+        It is the frame given last, but for the `StartSettings.lag` frames after a start was begun, which queue up.
+        """
+        decided = len(self.poses) - len(self._queue)
+        return self.poses[decided - 1] if decided else None
+
+    @property
+    def status(self) -> Status:
+        """Status of the newest frame."""
+        return self.poses[-1].status if self.poses else Status.INITIALISING
+
+    @property
+    def keyframes(self) -> int:
+        """Base frames kept since the last start."""
+        return 0 if self._follower is None else self._follower.keyframes
+
+    @property
+    def changes(self) -> int:
+        """How often the single pair was replaced (inherit, paper)."""
+        return self._changes + (0 if self._follower is None else len(self._follower.begun))
+
+    def trajectory(self) -> Trajectory:
+        """The trajectory so far, camera to world; a frame without a pose repeats its neighbour's, by its status.
+
+        Raises `InitialisationError`, with the reason, where no frame has a pose.
+        """
+        self.finish()
+        return trajectory(self.poses, self.reason)
+
+    def points(self) -> Points:
+        """The points of all tracks so far, in the world frame, each as it was last known."""
+        self.finish()
+        if self._follower is not None:
+            _keep(self._points, self._follower.ended())
+        known = self._points.copy()
+        if self._follower is not None:
+            _keep(known, self._follower.present())
+        if not known:
+            return no_points()
+        ids = np.array(sorted(known))
+        xyz, covariance = (np.stack([known[i][k] for i in ids]) for k in (0, 1))
+        return Points(ids, xyz, covariance)
+
+    def recording(self) -> Recording:
+        """The tracks and base pairs so far, up to where the camera is lost, for `jaxtri.replay`.
+
+        Raises `InputError` where `record` is off, `InitialisationError` where there is no start yet.
+        """
+        if not self.record:
+            raise InputError("nothing was recorded: ask for it by record=True")
+        self.finish()
+        if not self._recorder.pairs:
+            raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
+        begun = self._follower.begun if self._recorder.on and self._follower is not None else []
+        inherit = self.base is Base.INHERIT
+        return self._recorder.recording(begun, self._dt, inherit=inherit, dtype=self._settings.sigma.dtype)
+
+    def _observe(
+        self,
+        index: int,
+        pixels: ArrayLike,
+        visible: ArrayLike,
+        time: float,
+        ids: ArrayLike | None,
+        quality: ArrayLike | None,
+    ) -> tuple[Observations, Slotted, np.ndarray]:
+        """The frame as the filters take it, its tracks in slots, and the number of each row."""
+        z = numbers("pixels", pixels, ("n", 2))
+        seen = booleans("visible", visible, (len(z),))
+        rows = np.arange(len(z)) if ids is None else numbers("ids", ids, (len(z),), np.int64)
+        known = None if quality is None else numbers("quality", quality, (len(z), 2))
+        if len(rows) and rows[seen].min(initial=0) < 0:
+            raise InputError(f"ids: {rows[seen].min()} is negative; number the tracks from 0")
+        if not math.isfinite(time) or (self.poses and not time > self.poses[-1].time):
+            before = f" does not follow {self.poses[-1].time}" if self.poses else " is no number of seconds"
+            raise InputError(f"frame {index}: its time {time}{before}")
+        if self.capacity is None:
+            self.capacity = capacity(len(z))
+        held = np.full(self.capacity, -1) if self._held is None else self._held
+        tracks = slotted(held, z, seen, rows, known)
+        dtype = self._settings.sigma.dtype
+        u = np.asarray(_normalise(self.camera, tracks.pixels.astype(dtype)))
+        tracks = tracks._replace(visible=tracks.visible & np.isfinite(u).all(axis=1))
+        quality_ = tracks.quality.astype(dtype)
+        return Observations(index, float(time), u, tracks.visible, tracks.ids, quality_), tracks, rows
+
+    def _dt(self, index: int) -> float:
+        if index == 0 or not self.frame_time:
+            return 1.0
+        return (self.poses[index].time - self.poses[index - 1].time) / self.frame_time
+
+    def _take_in(self, newest: float, most: float) -> np.ndarray:
+        """Up to `most` queued frames, in order, but none before a start is there; the numbers of tracks to give up."""
+        outliers: list[np.ndarray] = []
+        while True:
+            if self._seeking:
+                search = self._search = self._search or self._begin_beside()
+                if newest < self._waiting[-1].index + self._start.lag:
+                    break
+                self._settle(search.result())
+            if not self._queue or len(outliers) >= most:
+                break
+            frame = self._queue.pop(0)
+            if self._follower is None:
+                self._waiting.append(frame)
+                self._try_start()
+                continue
+            report = self._follower.follow(frame, self._dt(frame.index))
+            self.poses[frame.index] = FramePose.of(frame.time, report)
+            outliers.append(frame.ids[np.asarray(report.drop)])
+            if self.poses[frame.index].status is Status.LOST:
+                self._lose(frame)
+        return np.concatenate(outliers or [np.zeros(0, np.int64)])
+
+    # -- starting ---------------------------------------------------------------------------------------------
+
+    def _try_start(self) -> None:
+        """Look for a base pair between the first waiting frame and the newest."""
+        now = self._waiting[-1]
+        while len(self._waiting) > 1:
+            first = self._waiting[0]
+            common = first.common(now)
+            if common.sum() >= max(self._start.points, self._start.common * first.visible.sum()):
+                break
+            # Too little is left of the first frame: wait from a later one.
+            self._passed.append(self._waiting.pop(0))
+        if len(self._waiting) < 2:
+            self.reason = f"only {int(now.visible.sum())} features in frame {now.index}, and fewer last"
+            return
+        first, common = self._waiting[0], self._waiting[0].common(now)
+        width = (self.camera.width or 0) / float(jnp.sqrt(self.camera.fx * self.camera.fy))
+        flow = float(np.median(np.linalg.norm(now.u[common] - first.u[common], axis=1))) / width
+        if flow < self._start.flow:
+            self.reason = f"the median flow is {flow:.1%} of the image width, {self._start.flow:.1%} needed"
+            return
+        tried, before = self._tried
+        if tried != first.index or flow >= AGAIN * before:
+            self._tried, self._seeking = (first.index, flow), True
+
+    def _begin_beside(self) -> Future[_Begun | str]:
+        """`_begin` in a thread of its own."""
+        # What a `with` has set in JAX holds for the thread that says so alone.
+        x64, device = jax.enable_x64.value, jax.default_device.value
+
+        def begin() -> _Begun | str:
+            with jax.enable_x64(x64), jax.default_device(device):
+                return self._begin()
+
+        pool = ThreadPoolExecutor(1, thread_name_prefix="start")
+        search = pool.submit(begin)
+        pool.shutdown(wait=False)
+        return search
+
+    def _settle(self, begun: _Begun | str) -> None:
+        """Go on from a start that was worked out beside, or without one."""
+        self._search, self._seeking = None, False
+        if isinstance(begun, str):
+            self.reason = begun
+            return
+        for index, pose in begun.poses.items():
+            self.poses[index] = pose
+        if self.starts == 0:
+            self._recorder.pairs = [begun.pair]
+            self.base_pair = begun.pair.first, begun.pair.second
+        elif self.scale_unknown_from is None:
+            self.scale_unknown_from = begun.pair.first
+        self._follower = begun.follower
+        self.starts += 1
+        self._waiting, self._passed = [], []
+
+    def _begin(self) -> _Begun | str:
+        """The filter from a base pair of waiting frames, those between and before filled in; or why it has to wait.
+
+        Other frames are queued meanwhile, so it only reads, and only what they do not change.
+        """
+        frames = self._waiting
+        searched = find(self._settings, self._start, frames)
+        if searched.found is None:
+            return searched.reason
+        pose = searched.found.pose
+        first, last = frames[0], frames[-1]
+        again = self.starts > 0
+        world = identity(pose.translation.dtype)
+        if again:
+            held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
+            world = SE3.from_matrix(jnp.asarray(held, pose.translation.dtype))
+            state, _ = fill(self._settings, [first, last], pose, world, [1.0])
+            pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
+        state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
+        status = Status.RESTARTED if again else Status.TRACKING
+        poses = {first.index: FramePose(first.time, status, pose_matrix(world), np.zeros((6, 6)))}
+        reports = [*reports, *self._backwards(first, state, world)]
+        poses |= {f.index: FramePose.of(f.time, report) for f, report in reports}
+        if self.base is Base.TRACKS:
+            follower: Follower = TrackPairs.after(self._settings, state, last, first.common(last))
+        else:
+            assert isinstance(self.base, Base)
+            follower = SinglePair.after(self._settings, self._start, self.base, frames, pose, world)
+        pair = BasePair(first.index, last.index, first.index, searched.found.pose, searched.found.inside)
+        return _Begun(pair, follower, poses)
+
+    def _backwards(self, first: Observations, state, world: SE3) -> Iterator[tuple[Observations, Report]]:
+        """Frames that waited before the first base frame, newest first, as far as its tracks reach."""
+        mean = eqx.tree_at(
+            lambda m: (m.pose, m.twist), state.belief.mean, (world, jnp.zeros_like(state.belief.mean.twist))
+        )
+        state = state._replace(belief=eqx.tree_at(lambda b: b.mean, state.belief, mean))
+        for frame in reversed(self._passed):
+            state, report = hold(self._settings, state, frame, first.common(frame), 1.0)
+            if int(report.status) != Status.TRACKING:
+                return
+            yield frame, report
+
+    def _lose(self, frame: Observations) -> None:
+        """The camera is lost: start again from here."""
+        assert self._follower is not None
+        self._changes += len(self._follower.begun)
+        self._recorder.stop(frame.index, self._follower.begun)
+        for queued in self._queue:
+            self.poses[queued.index].status = Status.LOST
+        self._depth = self._follower.depth
+        for points in (self._follower.ended(), self._follower.present()):
+            _keep(self._points, points)
+        self._follower = None
+        self._waiting, self._tried = [frame], (-1, 0.0)
+        self.reason = "too few points agreed with any motion"
+
+
+def _keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> None:
+    # A track that two segments share is kept as the more exact of the two knows it.
+    for i, x, c in zip(*points, strict=True):
+        if int(i) not in known or np.trace(c) < np.trace(known[int(i)][1]):
+            known[int(i)] = (x, c)

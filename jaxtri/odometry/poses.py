@@ -1,0 +1,84 @@
+"""Poses of single frames on the host, and the trajectory that they make."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxlie import SE3
+
+from jaxtri.errors import InitialisationError
+from jaxtri.odometry.settings import Report, Status
+from jaxtri.trajectory import Trajectory
+
+_as_matrix = jax.jit(SE3.as_matrix)
+
+
+@dataclass
+class FramePose:
+    """One frame of the result.
+
+    Attributes:
+        time: Seconds.
+        status: What the pose is worth.
+        T_camera_world: (4, 4), world to camera, translation in scene units; None where there is no pose.
+        covariance: (6, 6), of the pose's error exp(xi) T_camera_world, (linear, angular) in camera axes, scene
+            units and radians; None where there is no pose.
+        used: How many points agreed.
+        nis: Normalised innovation squared of these points: 2 `used` is right. NaN where nothing was measured.
+    """
+
+    time: float
+    status: Status
+    T_camera_world: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    used: int = 0
+    nis: float = float("nan")
+
+    @classmethod
+    def of(cls, time: float, report: Report) -> "FramePose":
+        """The pose of a frame from what the filter reports of it."""
+        said, status = report.diagnostics, Status(int(report.status))
+        covariance = np.asarray(report.covariance, np.float64)
+        return cls(time, status, pose_matrix(report.pose), covariance, int(said.used), float(said.nis))
+
+    def scaled(self, scale: float) -> "FramePose":
+        """The pose in other units of length."""
+        if self.T_camera_world is None or self.covariance is None:
+            return self
+        T, s = self.T_camera_world.copy(), np.repeat([scale, 1.0], 3)
+        T[:3, 3] *= scale
+        return replace(self, T_camera_world=T, covariance=self.covariance * np.outer(s, s))
+
+
+def pose_matrix(pose: SE3) -> np.ndarray:
+    """The (4, 4) matrix of a pose, in double precision."""
+    return np.asarray(_as_matrix(pose), np.float64)
+
+
+def trajectory(poses: Sequence[FramePose], reason: str) -> Trajectory:
+    """The trajectory of all frames, camera to world; a frame without a pose repeats its nearest neighbour's.
+
+    Raises `InitialisationError`, with the reason, where no frame has a pose.
+    """
+    known = [i for i, p in enumerate(poses) if p.T_camera_world is not None]
+    if not known:
+        raise InitialisationError(
+            f"no camera motion was found in {len(poses)} frames: {reason}. A camera that stands still "
+            "or only turns shows no parallax: give a longer sequence with sideways motion, or ask for less "
+            "parallax"
+        )
+    nearest = [known[int(np.argmin(np.abs(np.array(known) - i)))] for i in range(len(poses))]
+    T = np.stack([poses[i].T_camera_world for i in nearest])  # pyright: ignore[reportArgumentType, reportCallIssue]
+    C = np.stack([poses[i].covariance for i in nearest])  # pyright: ignore[reportArgumentType, reportCallIssue]
+    R = np.swapaxes(T[:, :3, :3], 1, 2)
+    world = np.tile(np.eye(4), (len(T), 1, 1))
+    world[:, :3, :3] = R
+    world[:, :3, 3] = 0.0 - np.einsum("tij,tj->ti", R, T[:, :3, 3])
+    # exp(xi) T_camera_world moves the centre by -R' rho and turns R_world_camera by exp(-theta) on the right.
+    J = np.zeros((len(T), 6, 6))
+    J[:, :3, :3] = -R
+    J[:, 3:, 3:] = -np.eye(3)
+    times = np.array([p.time for p in poses])
+    status = np.array([int(p.status) for p in poses])
+    return Trajectory(times, world, J @ C @ np.swapaxes(J, 1, 2), status)

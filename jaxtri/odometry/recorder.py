@@ -1,0 +1,66 @@
+"""What a run keeps of its tracks and base pairs, so that it can be done again as a pure function: `jaxtri.replay`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxlie import SO3
+
+from jaxtri.odometry.replay import Recording
+from jaxtri.odometry.slots import Slotted
+from jaxtri.odometry.start import BasePair
+
+
+@dataclass
+class Recorder:
+    """The tracks of a run up to where the camera is lost, and its base pairs.
+
+    Attributes:
+        on: Tracks are kept.
+        tracks: Of all frames so far, in slots.
+        pairs: Base pairs of the segments: the first, and once the camera is lost those that followed it.
+    """
+
+    on: bool
+    tracks: list[Slotted] = field(default_factory=list)
+    pairs: list[BasePair] = field(default_factory=list)
+
+    def take(self, tracks: Slotted) -> None:
+        """The next frame."""
+        if self.on:
+            self.tracks.append(tracks)
+
+    def stop(self, frame: int, begun: list[BasePair]) -> None:
+        """The camera is lost in this frame; `begun` are the base pairs since the first."""
+        if self.on:
+            del self.tracks[frame + 1 :]
+            self.pairs = [*self.pairs, *begun]
+        self.on = False
+
+    def recording(self, begun: list[BasePair], dt: Callable[[int], float], *, inherit: bool, dtype: Any) -> Recording:
+        """All of it as arrays; `begun` are base pairs that are not in `pairs` yet, `dt` that of a frame."""
+        pairs = [*self.pairs, *begun]
+        origin, kept = pairs[0].first, self.tracks[pairs[0].first :]
+        ends = [*(p.last for p in pairs[1:]), origin + len(kept) - 1]
+        measured = [np.arange(p.second + 1, end + 1) - origin for p, end in zip(pairs, ends, strict=True)]
+        frames = np.full((len(pairs), max(1, *map(len, measured))), -1)
+        for row, those in zip(frames, measured, strict=True):
+            row[: len(those)] = those
+        pixels, visible, ids, quality = (np.stack(x) for x in zip(*kept, strict=True))
+        return Recording(
+            jnp.asarray(pixels, dtype),
+            jnp.asarray(visible),
+            jnp.asarray(ids),
+            jnp.asarray(quality, dtype),
+            jnp.asarray([dt(origin + k) for k in range(len(kept))], dtype),
+            jnp.asarray([p.first - origin for p in pairs]),
+            jnp.asarray([p.second - origin for p in pairs]),
+            jnp.asarray(frames),
+            jnp.stack([p.found.translation for p in pairs]),
+            SO3(jnp.stack([p.found.rotation.wxyz for p in pairs])),
+            jnp.asarray(np.stack([p.inside for p in pairs])),
+            jnp.asarray(origin),
+            inherit=inherit,
+        )

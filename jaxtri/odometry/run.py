@@ -1,0 +1,253 @@
+"""From frames to a trajectory: feature tracking, the recursive filter, and what is worth keeping of both."""
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+import numpy as np
+from jaxtyping import ArrayLike
+from tqdm import tqdm
+
+from jaxtri.checks import booleans, numbers
+from jaxtri.compilation import capacity
+from jaxtri.errors import CameraError, InputError
+from jaxtri.formats.archive import Archived
+from jaxtri.geometry.camera import Camera
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.settings import Base, Settings, StartSettings, Status
+from jaxtri.odometry.structure import Points
+from jaxtri.trajectory import Trajectory
+from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
+from jaxtri.vision.video import Frame, FrameSource, ahead
+
+
+@dataclass
+class Run(Archived):
+    """What a sequence gave.
+
+    Attributes:
+        trajectory: Camera poses, camera to world, one a frame.
+        points: The scene, a point a track.
+        colours: (n, 3) uint8 RGB of the points.
+        odometry: What the filters said of every frame.
+        statistics: Figures of the run, as `run.json` has them.
+    """
+
+    trajectory: Trajectory
+    points: Points
+    colours: np.ndarray
+    odometry: Odometry
+    statistics: dict[str, object] = field(default_factory=dict)
+
+    def scaled(self, scale: float) -> "Run":
+        """The same run in other units of length: trajectory, points and poses multiplied by `scale`."""
+        odometry = copy(self.odometry)
+        odometry.poses = [p.scaled(scale) for p in self.odometry.poses]
+        points = Points(self.points.ids, self.points.xyz * scale, self.points.covariance * scale**2)
+        return replace(self, trajectory=odometry.trajectory(), points=points, odometry=odometry)
+
+
+def track(
+    source: Iterable[Frame],
+    camera: Camera,
+    *,
+    base: Base | str = Base.TRACKS,
+    settings: Settings | None = None,
+    start: StartSettings | None = None,
+    klt: KLTSettings | None = None,
+    progress: bool = True,
+    max_frames: int | None = None,
+    record: bool = False,
+) -> Run:
+    """Recover the camera's trajectory from the frames of a source, one pass, in order.
+
+    Frames are decoded by a thread of their own, and their features followed by another, while others are filtered.
+
+    With `record` the run can be differentiated: `run.odometry.recording()` and `jaxtri.replay`.
+    An interrupt (Ctrl-C) ends the sequence there; what was tracked so far is kept. Raises
+    `InitialisationError` where the camera never moved enough, `CameraError` where the frames are not of the
+    size the camera was calibrated for, `InputError` on fewer than two frames, and what the source raises.
+    """
+    klt = klt or KLTSettings()
+    features, odometry = KLT(klt), Odometry(camera, settings, base, start, record=record, capacity=klt.capacity)
+    colours: dict[int, np.ndarray] = {}
+    clock = _Clock()
+    declared = source.declared if isinstance(source, FrameSource) else None
+    bar = tqdm(total=declared, unit="frame", disable=None if progress else True, leave=False)
+    interrupted = False
+    try:
+        # What the filter gives up of a frame the next one shows no more, and its slots are free from the one after
+        # that on: the same whether the flow or the filter is faster.
+        outliers = np.zeros(0, np.int64)
+        frames = islice(source, max_frames)
+        with contextlib.closing(_followed(frames, camera, features, clock, lambda: outliers)) as followed:
+            for frame, tracks in followed:
+                with clock.part("filter"):
+                    tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers))
+                    _sample(colours, tracks, frame.image)
+                    quality = np.stack([tracks.error, tracks.eigenvalue], axis=1)
+                    give_up = odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids, quality=quality)
+                    outliers = tracks.ids[give_up]
+                newest = odometry.poses[-1]
+                bar.set_postfix_str(f"{newest.status.name.lower()}, {newest.used} points", refresh=False)
+                bar.update()
+                clock.frame()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        bar.close()
+    if len(odometry.poses) < 2:
+        raise InputError(f"{len(odometry.poses)} frame: a camera's motion needs at least two")
+    trajectory, points = odometry.trajectory(), odometry.points()
+    grey = np.full(3, 128, np.uint8)
+    rgb = np.array([colours.get(int(i), grey) for i in points.ids], np.uint8).reshape(-1, 3)
+    statistics = _statistics(odometry) | clock.statistics() | {"interrupted": interrupted}
+    return Run(trajectory, points, rgb, odometry, statistics)
+
+
+class _Clock:
+    """Where the time of a run goes."""
+
+    def __init__(self) -> None:
+        self._seconds = {"waiting for frames": 0.0, "optical flow": 0.0, "filter": 0.0}
+        self._milliseconds: list[float] = []
+        self._began = self._last = time.perf_counter()
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Counts what is done within."""
+        begun = time.perf_counter()
+        yield
+        self._seconds[name] += time.perf_counter() - begun
+
+    def frame(self) -> None:
+        """The end of a frame."""
+        now = time.perf_counter()
+        self._milliseconds.append(1e3 * (now - self._last))
+        self._last = now
+
+    def statistics(self) -> dict[str, object]:
+        """As `run.json` has them."""
+        return {
+            "frames_per_second": len(self._milliseconds) / (time.perf_counter() - self._began),
+            "seconds": {k: round(v, 3) for k, v in self._seconds.items()},
+            "milliseconds_of_frame": [round(m, 2) for m in self._milliseconds],
+        }
+
+
+def _followed(
+    source: Iterable[Frame], camera: Camera, features: KLT, clock: _Clock, given_up: Callable[[], np.ndarray]
+) -> Generator[tuple[Frame, FrameTracks], None, None]:
+    """Every frame with its tracks, the next one followed already; `given_up` are the outliers of the one before."""
+
+    def follow(image: np.ndarray) -> FrameTracks:
+        with clock.part("optical flow"):
+            return features.track(image)
+
+    with contextlib.closing(ahead(source)) as frames, ThreadPoolExecutor(1) as pool:
+
+        def following() -> tuple[Frame, Future[FrameTracks]] | None:
+            with clock.part("waiting for frames"):
+                frame = next(frames, None)
+            if frame is None:
+                return None
+            _same_size(camera, frame)
+            return frame, pool.submit(follow, frame.image)
+
+        now = following()
+        while now is not None:
+            frame, tracks = now[0], now[1].result()
+            features.drop(given_up())
+            now = following()
+            yield frame, tracks
+
+
+def warm_up(
+    camera: Camera,
+    *,
+    base: Base | str = Base.TRACKS,
+    settings: Settings | None = None,
+    start: StartSettings | None = None,
+    klt: KLTSettings | None = None,
+) -> None:
+    """Compile what `track` needs, with the same arguments, by following a few made-up tracks.
+
+    A first run spends most of its time compiling; a camera should not wait for it, and what is rendered or
+    read meanwhile need not either.
+    """
+    n = (klt or KLTSettings()).capacity
+    rng = np.random.default_rng(0)
+    w, h = camera.width or 2 * float(camera.cx), camera.height or 2 * float(camera.cy)
+    pixels = rng.uniform([0.2 * w, 0.2 * h], [0.8 * w, 0.8 * h], (n, 2))
+    depth = rng.uniform(1, 2, n)
+    odometry = Odometry(camera, settings, base, start, capacity=n)
+    for k in range(6):
+        shift = np.stack([0.04 * w * k / depth, np.zeros(n)], axis=1)
+        odometry.add(pixels + shift, np.ones(n, bool), float(k))
+    odometry.points()
+
+
+def follow_tracks(
+    camera: Camera,
+    pixels: ArrayLike,
+    visible: ArrayLike,
+    times: ArrayLike | None = None,
+    *,
+    base: Base | str = Base.TRACKS,
+    settings: Settings | None = None,
+    start: StartSettings | None = None,
+    record: bool = False,
+) -> Odometry:
+    """The same from feature tracks: `pixels` (t, n, 2) and `visible` (t, n), a column a track.
+
+    NaN where a track is not seen is as good as False. `times` (t,) in seconds, by default the frame number. The
+    columns are filled up to one of a few numbers, so that another number of tracks compiles nothing.
+    Raises `InputError` where a shape does not fit or there are fewer than two frames.
+    """
+    z = numbers("pixels", pixels, ("t", "n", 2))
+    seen = booleans("visible", visible, z.shape[:2])
+    t = np.arange(len(z), dtype=float) if times is None else numbers("times", times, (len(z),))
+    if len(z) < 2:
+        raise InputError(f"pixels hold {len(z)} frames; a camera's motion needs at least two")
+    odometry = Odometry(camera, settings, base, start, record=record, capacity=capacity(z.shape[1]))
+    for k in range(len(z)):
+        odometry.add(z[k], seen[k], float(t[k]))
+    odometry.finish()
+    return odometry
+
+
+def _same_size(camera: Camera, frame: Frame) -> None:
+    h, w = frame.image.shape[:2]
+    if camera.width is not None and camera.height is not None and (camera.width, camera.height) != (w, h):
+        raise CameraError(
+            f"the camera was calibrated at {camera.width}x{camera.height}, the frames are {w}x{h}: give the "
+            "calibration of this size, or resize the frames"
+        )
+
+
+def _sample(colours: dict[int, np.ndarray], tracks: FrameTracks, image: np.ndarray) -> None:
+    new = np.flatnonzero(tracks.fresh)
+    h, w = image.shape[:2]
+    x, y = tracks.pixels[new].round().astype(int).clip(0, [w - 1, h - 1]).T
+    colours |= dict(zip(tracks.ids[new].tolist(), image[y, x][:, ::-1], strict=True))
+
+
+def _statistics(odometry: Odometry) -> dict[str, object]:
+    status = Counter(p.status.name.lower() for p in odometry.poses)
+    used = [p.used for p in odometry.poses if p.status is Status.TRACKING]
+    return {
+        "frames": len(odometry.poses),
+        "status": dict(status),
+        "status_of_frame": [p.status.name.lower() for p in odometry.poses],
+        "starts": odometry.starts,
+        "restarts": odometry.changes,
+        "scale_unknown_from_frame": odometry.scale_unknown_from,
+        "base_pair": odometry.base_pair,
+        "keyframes": odometry.keyframes,
+        "points_used_per_frame": float(np.mean(used)) if used else 0.0,
+    }
