@@ -2,14 +2,17 @@
 
 import sys
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from jaxtri.errors import CameraError, InputError, JaxtriError, TruncatedVideoWarning
+
+# The rest is imported where it is called: help and a wrong option need not wait for it.
+if TYPE_CHECKING:
+    from jaxtri.geometry.camera import Camera
 
 
 @dataclass
@@ -45,6 +48,8 @@ class Track:
     """Write overlay.mp4."""
     recording: bool = False
     """Write recording.rrd for the rerun viewer (extra `viewer`)."""
+    starts: str = "opencv"
+    """Who proposes the relative poses of a start: `opencv`, or `poselib` beside it (extra `init`)."""
     strict: bool = False
     """Fail on a truncated source instead of warning."""
     quiet: bool = False
@@ -111,64 +116,64 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 
 
 def _track(options: Track) -> None:
-    from jaxtri.pipeline import warm_up
-    from jaxtri.results import write_overlay, write_results
+    from jaxtri.odometry.run import track, warm_up
+    from jaxtri.output.report import run_text
+    from jaxtri.output.results import write_results
     from jaxtri.vision.video import open_source, spool
 
     _check(options)
-    base = _base(options.base)
     live = options.source.isdecimal() and not Path(options.source).exists()
     if live and options.max_frames is None:
         print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
     with open_source(options.source, fps=options.fps, strict=options.strict) as source:
         camera = _camera(options, source.size)
+        how = _how(camera, options)
         if live:
-            warm_up(camera, **_options(camera, base, options))
+            warm_up(camera, **how)
         frames: Any = spool(source, options.out / "frames") if live else source
-        run = _run(frames, camera, base, options)
+        run = track(frames, camera, progress=not options.quiet, max_frames=options.max_frames, **how)
         fps = source.fps
-    paths = write_results(
-        run, options.out, {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
-    )
+    said = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
+    paths = write_results(run, options.out, said)
     if options.recording:
-        from jaxtri.vision.viewer import write_recording
+        from jaxtri.output.viewer import write_recording
 
         paths.append(write_recording(run, camera, options.out / "recording.rrd"))
     if options.overlay:
-        again = options.out / "frames" if live else options.source
-        with warnings.catch_warnings(), open_source(again, fps=options.fps) as source:
-            warnings.simplefilter("ignore", TruncatedVideoWarning)  # said once already
-            try:
-                overlay = options.out / "overlay.mp4"
-                paths.append(
-                    write_overlay(run, source, camera, overlay, fps, at=options.place, progress=not options.quiet)
-                )
-            except InputError as error:
-                if options.place is not None:
-                    raise
-                print(f"jaxtri: warning: no overlay: {error}", file=sys.stderr)
-    _summarise(run, paths)
+        paths += _overlay(options, run, camera, options.out / "frames" if live else options.source, fps)
+    print(run_text(run, paths))
+
+
+def _overlay(options: Track, run: Any, camera: "Camera", source: Path | str, fps: float) -> list[Path]:
+    """The overlay over a second reading of the frames; none, with a warning, where the car has no place."""
+    from jaxtri.output.results import write_overlay
+    from jaxtri.vision.video import open_source
+
+    with warnings.catch_warnings(), open_source(source, fps=options.fps) as again:
+        warnings.simplefilter("ignore", TruncatedVideoWarning)  # said once already
+        path = options.out / "overlay.mp4"
+        try:
+            return [write_overlay(run, again, camera, path, fps, at=options.place, progress=not options.quiet)]
+        except InputError as error:
+            if options.place is not None:
+                raise
+            print(f"jaxtri: warning: no overlay: {error}", file=sys.stderr)
+            return []
 
 
 def _check(options: Track) -> None:
-    """Numbers that no run can use, named before anything is opened."""
+    """Numbers and words that no run can use, named before anything is opened."""
     least = {"features": 50, "overlap": 1, "max_frames": 1, "min_parallax": 0, "noise_px": 1e-6}
     for name, low in least.items():
         value = getattr(options, name)
         if value is not None and not low <= value < float("inf"):
             raise InputError(f"--{name.replace('_', '-')} {value:g}: give a number of at least {low:g}")
+    for name, words in {"base": ("tracks", "inherit", "paper"), "starts": ("opencv", "poselib")}.items():
+        if getattr(options, name) not in words:
+            raise InputError(f"--{name} {getattr(options, name)}: choose one of {', '.join(words)}")
 
 
-def _base(name: str) -> Any:
-    from jaxtri.bases import Base
-
-    try:
-        return Base(name)
-    except ValueError:
-        raise InputError(f"--base {name}: choose one of {', '.join(b.value for b in Base)}") from None
-
-
-def _camera(options: Track, size: tuple[int, int]) -> Any:
+def _camera(options: Track, size: tuple[int, int]) -> "Camera":
     from jaxtri.formats import read_camera
     from jaxtri.geometry.camera import Camera
 
@@ -179,92 +184,48 @@ def _camera(options: Track, size: tuple[int, int]) -> Any:
     return Camera.from_fov(options.fov, *size)
 
 
-def _run(frames: Any, camera: Any, base: Any, options: Track) -> Any:
-    from jaxtri.pipeline import track
-
-    progress = not options.quiet
-    return track(frames, camera, progress=progress, max_frames=options.max_frames, **_options(camera, base, options))
-
-
-def _options(camera: Any, base: Any, options: Track) -> dict[str, Any]:
-    """The keyword arguments of `pipeline.track` and `pipeline.warm_up`."""
-    from jaxtri.bases import StartSettings
-    from jaxtri.tracker import Settings
+def _how(camera: "Camera", options: Track) -> dict[str, Any]:
+    """The keyword arguments that `odometry.run.track` and `warm_up` have in common."""
+    from jaxtri.odometry.settings import Base, Settings, StartSettings
     from jaxtri.vision.klt import KLTSettings
 
+    base = Base(options.base)
     changes = {} if options.min_parallax is None else {"parallax_deg": options.min_parallax}
+    poselib = options.starts == "poselib"
     return {
         "base": base,
         "settings": Settings.of(camera, noise_px=options.noise_px),
-        "start": StartSettings.of(base, overlap=options.overlap, **changes),
+        "start": StartSettings.of(base, overlap=options.overlap, poselib=poselib, **changes),
         "klt": KLTSettings(capacity=options.features),
     }
 
 
-def _summarise(run: Any, paths: list[Path]) -> None:
-    s = run.statistics
-    states = ", ".join(f"{count} {name}" for name, count in s["status"].items())
-    print(f"{s['frames']} frames at {s['frames_per_second']:.0f} a second: {states}")
-    print(f"{s['keyframes']} keyframes, {s['points_used_per_frame']:.0f} points a frame, {len(run.points.ids)} in all")
-    if s["scale_unknown_from_frame"] is not None:
-        print(f"the camera was lost: from frame {s['scale_unknown_from_frame']} on the scale is a guess")
-    if s["interrupted"]:
-        print("interrupted: these are the frames up to there")
-    for path in paths:
-        print(f"  {path}")
-
-
 def _evaluate(options: Evaluate) -> None:
     from jaxtri.formats import read_trajectory, write_json
+    from jaxtri.output.report import errors_text
     from jaxtri.trajectory import evaluate
 
     found = evaluate(read_trajectory(options.estimate), read_trajectory(options.groundtruth), with_scale=options.scale)
-    _print_errors(found)
+    print(errors_text(found))
     if options.json is not None:
         write_json(options.json, asdict(found))
 
 
-def _print_errors(found: Any) -> None:
-    print(f"{found.matched} frames matched, {found.coverage:.1%} of the reference; scale {found.scale:.6g}")
-    print(f"ATE  {found.ate_rmse:.6g} rmse, {found.ate_percent:.3f} % of the path")
-    print(f"RPE  {found.rpe_translation:.6g} ({found.rpe_translation_percent:.2f} % of the mean step), ", end="")
-    print(f"{found.rpe_rotation_deg:.4f} degrees a frame")
-    print(f"orientation {found.rotation_rmse_deg:.4f} degrees rmse")
-
-
 def _demo(options: Demo) -> None:
-    from jaxtri.formats import read_tum
-    from jaxtri.pipeline import warm_up
-    from jaxtri.results import write_overlay, write_results
-    from jaxtri.synthetic import laboratory
-    from jaxtri.synthetic.rendered import write_footage
-    from jaxtri.trajectory import evaluate
-    from jaxtri.vision.video import open_source
+    from jaxtri.output.demo import demo
+    from jaxtri.output.report import errors_text, run_text
 
     if options.frames < 2:
         raise InputError(f"--frames {options.frames}: a camera's motion needs at least two")
-    folder = options.out / "sequence"
     print(f"rendering {options.frames} frames of a laboratory, the camera sliding sideways before some boxes")
-    track, base = Track(str(folder), quiet=options.quiet), _base("tracks")
-    footage = laboratory(options.frames, options.seed)
-    with ThreadPoolExecutor(1) as pool:  # the filters compile while the frames are rendered
-        ready = pool.submit(warm_up, footage.camera, **_options(footage.camera, base, track))
-        camera = write_footage(folder, footage, options.seed, progress=not options.quiet)
-        ready.result()
-    truth = read_tum(folder / "groundtruth.txt")
-    with open_source(folder) as source:
-        run = _run(source, camera, base, track)
-        fps = source.fps
-    found = evaluate(run.trajectory, truth)
-    run = run.scaled(found.scale)  # the gauge is known here: metres
-    paths = write_results(run, options.out, asdict(options) | {"out": str(options.out)}, reference=truth)
-    with open_source(folder) as source:
-        overlay = options.out / "overlay.mp4"
-        paths.append(write_overlay(run, source, camera, overlay, fps, progress=not options.quiet))
-    _summarise(run, paths)
+    said = asdict(options) | {"out": str(options.out)}
+    done = demo(options.out, said, frames=options.frames, seed=options.seed, progress=not options.quiet)
+    print(run_text(done.run, done.paths))
     print("errors against the truth, in metres:")
-    _print_errors(found)
-    print(f"look at {options.out / 'trajectory.png'} and {options.out / 'overlay.mp4'}; the frames are in {folder}")
+    print(errors_text(done.errors))
+    print(
+        f"look at {options.out / 'trajectory.png'} and {options.out / 'overlay.mp4'}; the frames are in {done.frames}"
+    )
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ from tqdm import tqdm
 from jaxtri.errors import InputError
 from jaxtri.formats import atomic_path, write_json, write_ply, write_tum
 from jaxtri.geometry.camera import Camera
-from jaxtri.pipeline import Run
-from jaxtri.plot import plot_trajectory
-from jaxtri.tracker import Status
+from jaxtri.odometry.run import Run
+from jaxtri.odometry.settings import Status
+from jaxtri.output.overlay import car, draw_text, draw_wireframe, place
+from jaxtri.output.plot import plot_trajectory
 from jaxtri.trajectory import Trajectory
-from jaxtri.vision.overlay import car, draw_text, draw_wireframe, place
 from jaxtri.vision.video import Frame, write_video
 
 PACKAGES = ("jaxtri", "jax", "equinox", "optimistix", "jaxlie", "numpy", "opencv-python-headless")

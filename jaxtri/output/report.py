@@ -1,0 +1,36 @@
+"""A run and its errors in words."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from jaxtri.odometry.run import Run
+from jaxtri.trajectory import Evaluation
+
+
+def run_text(run: Run, paths: Iterable[Path]) -> str:
+    """What a run gave, and the files that it is in."""
+    s = run.statistics
+    status = s["status"]
+    assert isinstance(status, dict)
+    states = ", ".join(f"{count} {name}" for name, count in status.items())
+    points = f"{s['points_used_per_frame']:.0f} points a frame, {len(run.points.ids)} in all"
+    lines = [
+        f"{s['frames']} frames at {s['frames_per_second']:.0f} a second: {states}",
+        f"{s['keyframes']} keyframes, {points}",
+    ]
+    if s["scale_unknown_from_frame"] is not None:
+        lines.append(f"the camera was lost: from frame {s['scale_unknown_from_frame']} on the scale is a guess")
+    if s["interrupted"]:
+        lines.append("interrupted: these are the frames up to there")
+    return "\n".join([*lines, *(f"  {path}" for path in paths)])
+
+
+def errors_text(found: Evaluation) -> str:
+    """How far a trajectory is from another; lengths in units of the reference."""
+    return (
+        f"{found.matched} frames matched, {found.coverage:.1%} of the reference; scale {found.scale:.6g}\n"
+        f"ATE  {found.ate_rmse:.6g} rmse, {found.ate_percent:.3f} % of the path\n"
+        f"RPE  {found.rpe_translation:.6g} ({found.rpe_translation_percent:.2f} % of the mean step), "
+        f"{found.rpe_rotation_deg:.4f} degrees a frame\n"
+        f"orientation {found.rotation_rmse_deg:.4f} degrees rmse"
+    )
