@@ -11,20 +11,29 @@ from jaxtri.checks import number
 
 Taken = TypeVar("Taken", bound=PyTree)
 
+PASSES = 4  # linearisations of an update without outliers: fewer cost accuracy, more gain nothing
+
 
 class Robust(eqx.Module):
     """Graduated Geman-McClure weights w = (1 + m2/c)^-2, then a hard gate.
 
     The scale c falls geometrically from `start` to `scale` over the passes, so that the first pass sees a
-    convex problem; m2 is the squared Mahalanobis distance under the measurement noise, not under the
-    prediction: gating against the prediction throws good points away whenever the motion changes. `gate`
-    is the m2 above which an item is left out in the end; 13.8 is the 99.9 % quantile of 2 components. A
-    higher `start` survives a worse prediction and needs more passes: 1e5 nine, 1e7 about sixteen.
+    convex problem. m2 is the squared Mahalanobis distance of an item under the measurement noise, not under the
+    prediction: gating against the prediction throws good points away whenever the motion changes.
+
+    Attributes:
+        start: First c. A higher one survives a worse prediction and needs more passes. 1e5 loses none of 200 trials
+            with 40 % outliers, 1e4 loses one.
+        scale: Last c: an item at m2 = 16 then counts a quarter.
+        gate: m2 above which an item is left out in the end; 13.8 is the 99.9 % quantile of 2 components. For one
+            component take 10.8, for three 16.3.
+        passes: Linearisations that the weights need to come down (static): 9 from 1e5, about 16 from 1e7.
     """
 
     start: Float[Array, ""] = eqx.field(default=1e5, converter=number)
     scale: Float[Array, ""] = eqx.field(default=16.0, converter=number)
     gate: Float[Array, ""] = eqx.field(default=13.8, converter=number)
+    passes: int = eqx.field(static=True, default=9)
 
     def weights(self, distance: Float[Array, " n"], k: Int[Array, ""], passes: int) -> Float[Array, " n"]:
         """Weights in pass k of `passes`, of items whose squared Mahalanobis distance is given."""
@@ -34,17 +43,30 @@ class Robust(eqx.Module):
         return (1 + distance / c) ** -2
 
 
+def count_passes(passes: int | None, robust: Robust | None) -> int:
+    """How often an update linearises: as asked, or 4, or as often as the robust weights need."""
+    if passes is not None:
+        return passes
+    return PASSES if robust is None else robust.passes
+
+
 class Diagnostics(eqx.Module):
     """What an update reports beside the belief.
 
-    `log_likelihood` of the innovations and `nis`, the normalised innovation squared (chi-square with
-    `used * m` degrees of freedom for a consistent filter), are taken at the last linearisation: Laplace's
-    approximation, exact for one pass of a linear model. After robust weights both are those of the `used` items,
-    each counted in full, about the robust estimate; of the `measured` ones the gate has left out the others.
-    `distance` is m2 of every item after the update under the measurement noise alone (zero where masked).
+    Likelihood and NIS are taken at the last linearisation: Laplace's approximation, exact for one pass of a linear
+    model. After robust weights both are those of the `used` items, each counted in full, about the robust estimate.
 
     An update that overflows, as that of a filter which has long lost the track may, is not taken: the belief
     stays as predicted, `used` is zero and `log_likelihood` minus infinity.
+
+    Attributes:
+        log_likelihood: Logarithm of the density of the innovations.
+        nis: Normalised innovation squared: chi-square with `used` times m degrees of freedom for a consistent filter.
+        measured: How many items were seen.
+        used: How many of these the gate has left.
+        weights: (n,) weight of every item, zero where it was masked or left out.
+        distance: (n,) squared Mahalanobis distance of every item after the update, under the measurement noise alone;
+            zero where masked.
     """
 
     log_likelihood: Float[Array, ""]

@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxtri.checks import checked
 from jaxtri.filters import projective
-from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
+from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown
 from jaxtri.filters.linalg import Inverse, Prior, linearised, whiten
 from jaxtri.filters.masks import replace_masked, safe_root, stand_in
 from jaxtri.filters.model import Belief, Dynamics, Mean, Model, change_of_origin, predict
 from jaxtri.filters.projective import Moments, Projective
-from jaxtri.filters.scan import checkpointed
+from jaxtri.filters.scan import checkpointed, each_frame
 from jaxtri.filters.smoother import smooth
 
 __all__ = [
@@ -82,23 +83,33 @@ class _Linearisation(eqx.Module):
         return H.T @ H, H.T @ r.reshape(-1)
 
 
+def _each(function: Callable[[Any], Array], items: PyTree, n: int) -> Array:
+    """The function of all items; of none, where a model measures without, n times the same."""
+    if not jax.tree.leaves(items):
+        value = function(items)
+        return jnp.broadcast_to(value, (n, *value.shape))
+    return jax.vmap(function)(items)
+
+
 def _linearise(
     model: Model, prior: Any, delta: Array, items: PyTree, observed: Array, mask: Array, scale: Array | None
 ) -> _Linearisation:
     """Residual, Jacobian with respect to the error of the *prior*, and noise, at `retract(prior, delta)`."""
+    compare = getattr(model, "residual", jnp.subtract)
+    # A copy of another observation stands in for what is masked: a residual may be singular at zero.
+    seen = stand_in(mask, observed)
 
-    def predicted(error: Array) -> Array:
+    def residual(error: Array) -> Array:
         mean = model.retract(prior, error)
-        return jax.vmap(lambda item: model.measure(mean, item))(items)
+        return jax.vmap(compare)(seen, _each(lambda item: model.measure(mean, item), items, len(seen)))
 
-    h, columns = linearised(predicted, delta)
+    left, slope = linearised(residual, delta)
     mean = model.retract(prior, delta)
-    noise = jax.vmap(lambda item: model.noise(mean, item))(items)
+    noise = _each(lambda item: model.noise(mean, item), items, len(seen))
     if scale is not None:
         noise = noise * jnp.square(scale)[:, None, None]
     whitener, log_det = jax.vmap(whiten)(noise)
-    whitened = replace_masked(mask, (observed - h, columns, whitener, log_det), 0.0)
-    return _Linearisation(*whitened)
+    return _Linearisation(*replace_masked(mask, (left, -slope, whitener, log_det), 0.0))
 
 
 def prepare(model: Model[Mean], items: PyTree[Array], mask: Bool[Array, " n"]) -> PyTree[Array]:
@@ -113,9 +124,12 @@ def prepare(model: Model[Mean], items: PyTree[Array], mask: Bool[Array, " n"]) -
 
 
 def _measuring(
-    model: Model[Mean], d: int, items: PyTree, mask: Bool[Array, " n"]
-) -> tuple[Callable[..., Evidence], np.ndarray]:
-    """A frame's evidence as a function of prior, error, observations, mask and noise scale; and the error's support."""
+    model: Model[Mean], belief: Belief[Mean], items: PyTree, mask: Bool[Array, " n"]
+) -> tuple[Callable[..., Evidence], np.ndarray, int]:
+    """A frame's evidence as a function of prior, error, observations, mask and noise scale.
+
+    Also the components of the error that it depends on, and how many components an item's residual has.
+    """
     items = prepare(model, items, mask)
     if isinstance(items, Moments):
         assert isinstance(model, Projective)
@@ -123,9 +137,11 @@ def _measuring(
         def at(prior: Mean, delta: Array, observed: Array, mask: Array, scale: Array | None) -> Evidence:
             return projective.linearise(model, prior, delta, items, observed, mask, scale)
 
-        return at, model.support
+        return at, model.support, 2
     items = stand_in(mask, items)
-    return lambda prior, delta, *frame: _linearise(model, prior, delta, items, *frame), np.arange(d)
+    noise = jax.eval_shape(lambda: _each(lambda item: model.noise(belief.mean, item), items, len(mask)))
+    support = np.arange(len(belief.covariance))
+    return lambda prior, delta, *frame: _linearise(model, prior, delta, items, *frame), support, noise.shape[-1]
 
 
 class _Pass(NamedTuple):
@@ -141,27 +157,34 @@ class _Pass(NamedTuple):
     nis: Float[Array, ""]
 
 
+@checked
 def update(
     model: Model[Mean],
     belief: Belief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n m"],
-    mask: Bool[Array, " n"],
+    mask: Bool[Array, " n"] | None = None,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
     noise_scale: Float[Array, " n"] | None = None,
 ) -> tuple[Belief[Mean], Diagnostics]:
     """The belief after the measurements of one frame.
 
-    `items` is what `model.measure` takes, with a leading axis n; `mask` False leaves an item out. `passes`
-    counts the linearisations (Gauss-Newton on the posterior, Bell & Cathey 1993): one is the plain EKF.
-    With `robust`, the passes before the last bring the weights down; eight or nine are needed. `noise_scale` is the
-    standard deviation of each item's noise over what the model says, where something more is known of it.
+    `items` is what `model.measure` takes, with a leading axis n, or None where it needs nothing. `observed` are the
+    measurements of all items; `mask` False leaves an item out, by default none. `passes` counts the linearisations
+    (Gauss-Newton on the posterior, Bell & Cathey 1993): one is the plain EKF, 4 the default. With `robust` the passes
+    before the last bring the weights down, and the default is `robust.passes`. `noise_scale` is the standard deviation
+    of each item's noise over what the model says, where something more is known of it.
+
+    Raises `InputError` where shapes or kinds do not fit, `passes` is below 1, a covariance is none, or the model's
+    sigma is not positive; warns (`UnitsWarning`) where normalised image points are clearly pixels.
     """
     P, mean = belief.covariance, belief.mean
     dtype, d = P.dtype, P.shape[0]
-    linearise, support = _measuring(model, d, items, mask)
+    mask = jnp.ones(len(observed), bool) if mask is None else mask
+    passes = count_passes(passes, robust)
+    linearise, support, components = _measuring(model, belief, items, mask)
     noise_scale, observed = replace_masked(mask, noise_scale, 1.0), replace_masked(mask, observed, 0.0)
     valid, prior = mask.astype(dtype), Prior.of(P, support)
     considered = getattr(model, "considered", None)
@@ -209,46 +232,48 @@ def update(
     posterior = Belief(moved, reset @ covariance @ reset.T)
 
     diagnostics = Diagnostics.of(
-        nis, inverse.log_det + noise_log_det, observed.shape[1], mask, used, weights=weights, distance=distance
+        nis, inverse.log_det + noise_log_det, components, mask, used, weights=weights, distance=distance
     )
     return unless_overflown(belief, posterior, diagnostics)[:2]
 
 
+@checked
 def step(
     model: Model[Mean],
     belief: Belief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n m"],
-    mask: Bool[Array, " n"],
+    mask: Bool[Array, " n"] | None = None,
     dt: Float[Array, ""] | float = 1.0,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
 ) -> tuple[Belief[Mean], Diagnostics]:
-    """Predict to the next frame and update with it."""
+    """Predict to the next frame, `dt` later, and update with it: arguments as of `update`."""
     return update(model, predict(model, belief, dt), items, observed, mask, passes=passes, robust=robust)
 
 
+@checked
 def filter(
     model: Model[Mean],
     belief: Belief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "t n m"],
-    mask: Bool[Array, "t n"],
-    dt: Float[Array, " t"] | None = None,
+    mask: Bool[Array, "t n"] | None = None,
+    dt: Float[Array, " t"] | Float[Array, ""] | float | None = None,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
     block: int = 1,
 ) -> tuple[Belief[Mean], Diagnostics]:
-    """Beliefs and diagnostics of all frames, stacked along a leading axis t.
+    """Beliefs and diagnostics of all frames, stacked along a leading axis t: arguments as of `update`.
 
-    `belief` stands before the first frame, which is predicted to. `items` are the same in every frame;
-    `dt` is one per frame, 1 by default. A reverse gradient keeps a belief a frame; of a long sequence, with
-    `block`, one in every `block` frames: `jaxtri.filters.scan`.
+    `belief` stands before the first frame, which is predicted to. `items` are the same in every frame; `dt` is the
+    time since the frame before, one for all or one a frame, 1 by default. A reverse gradient keeps a belief a frame;
+    of a long sequence, with `block`, one in every `block` frames: `jaxtri.filters.scan`.
     """
-    if dt is None:
-        dt = jnp.ones(observed.shape[0], belief.covariance.dtype)
+    mask = jnp.ones(observed.shape[:2], bool) if mask is None else mask
+    steps = each_frame(dt, len(observed), belief.covariance.dtype)
     items = prepare(model, items, mask.any(axis=0))
 
     def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
@@ -257,4 +282,4 @@ def filter(
         return carry, (carry, diagnostics)
 
     # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.
-    return checkpointed(body, belief, (observed, mask, dt), block)[1]
+    return checkpointed(body, belief, (observed, mask, steps), block)[1]

@@ -7,11 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtri.checks import checked
+
 Mean = TypeVar("Mean")
 
 
 class Belief(eqx.Module, Generic[Mean]):
-    """A Gaussian on a manifold: the true state is `retract(mean, delta)` with delta ~ N(0, covariance)."""
+    """A Gaussian on a manifold: the true state is `retract(mean, delta)` with delta ~ N(0, covariance).
+
+    Attributes:
+        mean: The state, any pytree that the model can `retract`.
+        covariance: (d, d) of the error delta; may be singular, as where a gauge is fixed.
+    """
 
     mean: Mean
     covariance: Float[Array, "d d"]
@@ -42,8 +49,13 @@ class Dynamics(Protocol[Mean]):
 class Model(Dynamics[Mean], Protocol[Mean]):
     """What a filter asks of its problem; every method is a pure function of one item.
 
-    A model may also have an attribute `considered`, a boolean array (d,): error components that are counted
-    with their covariance and never corrected (consider parameters, Schmidt 1966).
+    A model may also have
+
+    - `residual(observed, predicted)`, which compares the two where that is not their difference: a bearing is wrapped
+      to (-pi, pi] there, a unit vector taken to its tangent plane. The noise is that of the residual.
+    - an attribute `considered`, a boolean array (d,): error components that are counted with their covariance and
+      never corrected (consider parameters, Schmidt 1966).
+    - an attribute `normalised`, True where the measurements are normalised image points: pixels are warned of.
     """
 
     def measure(self, mean: Mean, item: Any) -> Float[Array, " m"]:
@@ -76,8 +88,9 @@ def transition(model: Dynamics[Mean], mean: Mean, dt: Float[Array, ""]) -> Float
     return jax.jacfwd(error)(jnp.zeros(noise.shape[0], noise.dtype))
 
 
-def predict(model: Model[Mean], belief: Belief[Mean], dt: Float[Array, ""] | float = 1.0) -> Belief[Mean]:
-    """The belief one time step later."""
+@checked
+def predict(model: Dynamics[Mean], belief: Belief[Mean], dt: Float[Array, ""] | float = 1.0) -> Belief[Mean]:
+    """The belief one time step `dt` later."""
     P = belief.covariance
     dt = jnp.asarray(dt, P.dtype)
     F = transition(model, belief.mean, dt)

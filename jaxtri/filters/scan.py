@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxtri.errors import InputError
 
@@ -31,6 +31,11 @@ def checkpointed(
         carry, ys = jax.lax.scan(body, carry, jax.tree.map(lambda x: x[whole:], xs))
         found.append(ys)
     return carry, found[0] if len(found) == 1 else jax.tree.map(lambda *y: jnp.concatenate(y), *found)
+
+
+def each_frame(dt: Float[Array, " t"] | Float[Array, ""] | float | None, count: int, dtype: Any) -> Float[Array, " t"]:
+    """The time steps of all frames: one for all, one for each, or 1."""
+    return jnp.broadcast_to(jnp.asarray(1.0 if dt is None else dt, dtype), (count,))
 
 
 def batch(run: Callable[[Any], Any], inputs: PyTree, size: int | None = None) -> PyTree:

@@ -19,11 +19,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
+from jaxtri.checks import checked
+from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown
 from jaxtri.filters.linalg import posterior_error, scales, whiten
 from jaxtri.filters.masks import replace_masked, safe_root, stand_in
 from jaxtri.filters.model import Belief, Dynamics, Mean, change_of_origin, transition
-from jaxtri.filters.scan import checkpointed
+from jaxtri.filters.scan import checkpointed, each_frame
 
 
 class ConsiderBelief(eqx.Module, Generic[Mean]):
@@ -85,6 +86,7 @@ def _times(F: Float[Array, "e d"], x: Float[Array, "d n p"]) -> Float[Array, "e 
     return (F @ _rows(x)).reshape(-1, *x.shape[1:])
 
 
+@checked
 def predict(
     model: ConsiderModel[Mean], belief: ConsiderBelief[Mean], dt: Float[Array, ""] | float = 1.0
 ) -> ConsiderBelief[Mean]:
@@ -144,15 +146,16 @@ def _linearise(
     return _Pass(at, item_noise, innovation, W, distance, log_det, D)
 
 
+@checked
 def update(
     model: ConsiderModel[Mean],
     belief: ConsiderBelief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n m"],
-    mask: Bool[Array, " n"],
+    mask: Bool[Array, " n"] | None = None,
     *,
     absorb: Bool[Array, " n"] | None = None,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
 ) -> tuple[ConsiderBelief[Mean], Diagnostics, ItemUpdate]:
     """The belief after the measurements of one frame; arguments as of `jaxtri.ekf.update`.
@@ -166,6 +169,8 @@ def update(
     one's gain is Schmidt's.
     """
     dtype, d = belief.own.dtype, belief.own.shape[0]
+    mask = jnp.ones(len(observed), bool) if mask is None else mask
+    passes = count_passes(passes, robust)
     present = mask if absorb is None else mask | absorb
     item_noise = model.item_noise(belief.mean, items)
     items, observed = stand_in(present, items), replace_masked(present, observed, 0.0)
@@ -248,40 +253,42 @@ def update(
     return posterior, diagnostics, jax.tree.map(lambda x: jnp.where(finite, x, 0), ItemUpdate(moved, gain, lin.at))
 
 
+@checked
 def step(
     model: ConsiderModel[Mean],
     belief: ConsiderBelief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n m"],
-    mask: Bool[Array, " n"],
+    mask: Bool[Array, " n"] | None = None,
     dt: Float[Array, ""] | float = 1.0,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
 ) -> tuple[ConsiderBelief[Mean], Diagnostics]:
     """Predict to the next frame and update with it."""
     return update(model, predict(model, belief, dt), items, observed, mask, passes=passes, robust=robust)[:2]
 
 
+@checked
 def filter(
     model: ConsiderModel[Mean],
     belief: ConsiderBelief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "t n m"],
-    mask: Bool[Array, "t n"],
-    dt: Float[Array, " t"] | None = None,
+    mask: Bool[Array, "t n"] | None = None,
+    dt: Float[Array, " t"] | Float[Array, ""] | float | None = None,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
     block: int = 1,
 ) -> tuple[Belief[Mean], Diagnostics]:
     """Beliefs, with their whole covariance, and diagnostics of all frames: as `jaxtri.ekf.filter`."""
-    if dt is None:
-        dt = jnp.ones(observed.shape[0], belief.own.dtype)
+    mask = jnp.ones(observed.shape[:2], bool) if mask is None else mask
+    steps = each_frame(dt, len(observed), belief.own.dtype)
 
     def body(carry: ConsiderBelief, frame: tuple) -> tuple[ConsiderBelief, tuple]:
         z, seen, elapsed = frame
         carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
         return carry, (total(model, carry, items), diagnostics)
 
-    return checkpointed(body, belief, (observed, mask, dt), block)[1]
+    return checkpointed(body, belief, (observed, mask, steps), block)[1]

@@ -4,19 +4,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtri.checks import checked
 from jaxtri.filters.linalg import regression
 from jaxtri.filters.model import Belief, Dynamics, Mean, change_of_origin, transition
+from jaxtri.filters.scan import each_frame
 
 
-def smooth(model: Dynamics[Mean], beliefs: Belief[Mean], dt: Float[Array, " t"] | None = None) -> Belief[Mean]:
+@checked
+def smooth(
+    model: Dynamics[Mean],
+    beliefs: Belief[Mean],
+    dt: Float[Array, " t"] | Float[Array, ""] | float | None = None,
+) -> Belief[Mean]:
     """Beliefs of all frames given all frames, earlier and later ones, from those of `filter` and its `dt`.
 
     Fixed-interval smoothing by Rauch, Tung & Striebel 1965 in the errors of the manifold; O(t d^3). Directions
     without uncertainty stay, and so do considered components, whose smoothed covariances are right besides:
     what a frame leaves open given the next has nothing in common with later noise, however that is weighted.
     """
-    if dt is None:
-        dt = jnp.ones(beliefs.covariance.shape[0], beliefs.covariance.dtype)
+    steps = each_frame(dt, len(beliefs.covariance), beliefs.covariance.dtype)
 
     @jax.checkpoint
     def body(later: Belief[Mean], frame: tuple[Belief[Mean], Array]) -> tuple[Belief[Mean], Belief[Mean]]:
@@ -36,5 +42,5 @@ def smooth(model: Dynamics[Mean], beliefs: Belief[Mean], dt: Float[Array, " t"] 
 
     last = jax.tree.map(lambda x: x[-1], beliefs)
     earlier = jax.tree.map(lambda x: x[:-1], beliefs)
-    _, found = jax.lax.scan(body, last, (earlier, dt[1:]), reverse=True)
+    _, found = jax.lax.scan(body, last, (earlier, steps[1:]), reverse=True)
     return jax.tree.map(lambda x, end: jnp.concatenate([x, end[None]]), found, last)
