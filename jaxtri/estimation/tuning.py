@@ -7,7 +7,7 @@ ground truth, the reprojection error. A parameter is any leaf of the model, whic
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
+from jaxtri.compilation import Stable
 from jaxtri.errors import InputError
 from jaxtri.filters.diagnostics import Diagnostics
 from jaxtri.filters.masks import stand_in
@@ -97,14 +98,17 @@ def fit(
 
     Raises `InputError` where a parameter cannot be fitted as it stands or the loss at the start is not finite.
     """
+    parameters = _parameters(parameters)
     if not parameters or starts < 1:
         raise InputError(f"{len(parameters)} parameters and {starts} starts: a fit wants at least one of each")
+    if not callable(loss):
+        raise InputError(f"loss is a {type(loss).__name__}; give a function of the model and the data")
     leaves = {name: jnp.asarray(p.where(model)) for name, p in parameters.items()}
     for name, p in parameters.items():
         if p.log and not bool(jnp.all(leaves[name] > p.floor)):
             raise InputError(f"{name} is {leaves[name]}: to be fitted by its logarithm it must be above {p.floor:g}")
     first = {name: p.free(leaves[name]) for name, p in parameters.items()}
-    objective = _Objective(model, first, jnp.asarray(-1), jnp.asarray(1.0), loss, tuple(parameters.items()))
+    objective = _Objective(model, first, jnp.asarray(-1), jnp.asarray(1.0), Stable(loss), tuple(parameters.items()))
     before = float(_evaluate(objective, first, data))
     if not math.isfinite(before):
         raise InputError(f"the loss at the start is {before}: begin with larger noises, or look for NaN in the data")
@@ -140,6 +144,17 @@ def fit(
     return Fit(fitted, converged, before, best, steps, changes)
 
 
+def _parameters(given: Any) -> dict[str, Parameter]:
+    """By name, each with a key that a notebook's cell, run again, finds the compiled program by."""
+    example = 'as {"sigma": tuning.Parameter(lambda model: model.sigma)}'
+    if not isinstance(given, Mapping):
+        raise InputError(f"parameters are a {type(given).__name__}; give them by name, {example}")
+    for name, parameter in given.items():
+        if not isinstance(parameter, Parameter):
+            raise InputError(f"parameters[{name!r}] is a {type(parameter).__name__}; give a Parameter, {example}")
+    return {name: replace(p, where=Stable(p.where)) for name, p in given.items()}
+
+
 class _Objective(eqx.Module):
     """The loss as a function of the free numbers; a pytree, so that a second fit of its kind is not compiled again."""
 
@@ -147,7 +162,7 @@ class _Objective(eqx.Module):
     first: dict[str, Array]
     bar: Int[Array, ""]  # of `_BARS`
     scale: Float[Array, ""]  # of the loss
-    loss: Callable[[Any, Any], Float[Array, ""]] = eqx.field(static=True)
+    loss: Stable = eqx.field(static=True)
     parameters: tuple[tuple[str, Parameter], ...] = eqx.field(static=True)
 
     def put(self, free: Mapping[str, Array]) -> Any:

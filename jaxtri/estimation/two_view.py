@@ -1,6 +1,7 @@
 """Maximum-likelihood pose of two views, with its covariance: the initial belief of every filter here."""
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,6 +25,26 @@ class TwoView(eqx.Module):
     covariance: Float[Array, "6 6"]
     rms: Float[Array, ""]
     converged: Bool[Array, ""]
+
+
+class _InOneDtype(optx.AbstractSearch):
+    """A search whose state has the dtype of the unknowns.
+
+    optimistix 0.1 begins a trust region with a step of JAX's default float, strongly typed: where that is double, a
+    problem in single precision ends in a ValueError of lineax.
+    """
+
+    search: optx.AbstractSearch
+
+    def init(self, y: Any, f_info_struct: Any) -> Any:
+        """The search's state."""
+        state = self.search.init(y, f_info_struct)
+        dtype = jnp.result_type(*jax.tree.leaves(y))
+        return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x, state)
+
+    def step(self, first_step: Any, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, state: Any) -> Any:
+        """The search's step."""
+        return self.search.step(first_step, y, y_eval, f_info, f_eval_info, state)
 
 
 def scaled(two_view: TwoView, length: Float[Array, ""] | float) -> TwoView:
@@ -98,6 +119,7 @@ def refine(
         return r if root is None else jnp.concatenate([r, root @ x])
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+    solver = eqx.tree_at(lambda s: s.search, solver, _InOneDtype(solver.search))
     solution = optx.least_squares(residuals, solver, jnp.zeros(5, dtype), max_steps=max_steps, throw=False)
     # One Newton step from where it ended, which is not differentiated, has the derivatives of the minimum, and what
     # the tolerance left open does not spread in differences of the result.

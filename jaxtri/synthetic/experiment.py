@@ -35,7 +35,7 @@ def paper_experiment(
     distance_m: float = 0.33,
     degrees_per_frame: tuple[float, float] = (0.2, 1.2),
     metres_per_frame: tuple[float, float] = (0.005, 0.015),
-    noise_px: float = 0.1,
+    noise_px: Float[Array, ""] | float = 0.1,
     focal_mm: float = 6.0,
     pixel_mm: float = 0.01,
     signs: Float[Array, "3 6"] | None = None,
@@ -92,7 +92,7 @@ def steady_experiment(
     distance_m: float = 1.0,
     jitter_m: float = 1e-3,
     jitter_degrees: float = 0.1,
-    noise_px: float = 0.1,
+    noise_px: Float[Array, ""] | float = 0.1,
     focal_px: float = 600.0,
 ) -> Experiment:
     """A cube of points before a camera that moves steadily, but for white jitter, in its own axes.

@@ -67,7 +67,7 @@ def box(
     centre: Sequence[float] | np.ndarray,
     size: Sequence[float] | np.ndarray,
     yaw: float,
-    faces: Sequence[UInt8[np.ndarray, "rows columns 3"]],
+    faces: Sequence[UInt8[np.ndarray, "_ _ 3"]],
 ) -> list[Quad]:
     """The six faces of a box turned by `yaw` radians about the y axis, textures upright as seen from outside.
 
