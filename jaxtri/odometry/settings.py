@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.checks import number
 from jaxtri.errors import InputError
 from jaxtri.filters import ekf
 from jaxtri.geometry.camera import Camera
@@ -16,11 +17,19 @@ from jaxtri.models.point_noise import PointNoise
 
 
 class Base(Enum):
-    """Which two base frames a track is measured from."""
+    """Which two base frames a track is measured from.
 
-    TRACKS = "tracks"  # a pair per track, drawn from keyframes
-    INHERIT = "inherit"  # one pair for all; a restart takes two frames already tracked
-    PAPER = "paper"  # one pair for all; a restart takes two consecutive frames and matches the scale
+    Attributes:
+        TRACKS: A pair per track, drawn from keyframes. Overlapping tracks carry the scale, so nothing is handed over:
+            on real video this kind has the smallest error by far (`benchmarks/real_sequences.py`).
+        INHERIT: One pair for all tracks. A new pair is made of two frames already tracked.
+        PAPER: One pair for all tracks, as in Yu et al. 2006. A new pair is made of two consecutive frames, and its
+            scale is that of the points which both pairs know.
+    """
+
+    TRACKS = "tracks"
+    INHERIT = "inherit"
+    PAPER = "paper"
 
     @classmethod
     def _missing_(cls, value: object) -> "Base":
@@ -28,44 +37,88 @@ class Base(Enum):
 
 
 class Status(IntEnum):
-    """What a pose is worth."""
+    """What a pose is worth.
 
-    INITIALISING = 0  # no pose yet: not enough parallax so far
+    Attributes:
+        INITIALISING: There is no pose yet: the camera has not shown enough parallax so far.
+        TRACKING: The pose is measured.
+        COASTING: The pose is predicted, not measured: too few points agreed with it.
+        RESTARTED: The first frame of a new start, after the camera was lost. From here on the scale is a guess.
+        LOST: There is no pose: the camera coasted for too long, or too few tracks are left.
+    """
+
+    INITIALISING = 0
     TRACKING = 1
-    COASTING = 2  # predicted only: too few points agreed
-    RESTARTED = 3  # the first frame of a new start; its scale is unknown unless said otherwise
-    LOST = 4  # no pose
+    COASTING = 2
+    RESTARTED = 3
+    LOST = 4
 
 
 class Settings(eqx.Module):
-    """What a tracker run may tune; lengths in normalised image units, angles in radians, times in frames.
+    """What a tracker run may tune; `Settings.of(camera)` fills it from pixels.
 
-    `Settings.of(camera)` fills them from pixels.
+    All fields but `passes` are leaves, scalars of one dtype. Lengths in the image are in normalised image units (pixels
+    over the focal length), angles in radians, times in frames. The defaults of `Settings.of` were found on the
+    sequences of `benchmarks/real_sequences.py`, and are the same for all of them.
+
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length. 0.4 px by
+            default: what fits the feature tracker of `jaxtri.vision` on real video (0.3 to 0.5 px). Lower, for rendered
+            footage or better tracks, makes covariances smaller and more points fail the gate.
+        acceleration: Standard deviation of the camera's acceleration, in median scene depths per frame^2. Higher trusts
+            the prediction less: it survives jerks and smooths less.
+        angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2. Higher and lower do
+            what they do for `acceleration`.
+        keyframe_flow: Median flow since the last keyframe, in normalised image units, from which a new keyframe is
+            made. 3.5 % of the image width by default. Higher gives longer base lines and fewer tracks that reach over
+            them.
+        keyframe_common: How many tracks must be left from the last keyframe; where there are fewer, a new one is made,
+            so that overlapping tracks can carry the scale.
+        keyframe_usable: Share of the visible tracks that must have a base pair which may measure; below it a new
+            keyframe is made. Higher brings new tracks into use sooner, from shorter base lines.
+        usable_parallax: Angle between the two rays of a track, in radians, from which its base pair may measure. 0.3
+            degrees by default. Lower uses new tracks sooner, whose depths are hardly known.
+        fixed_parallax: Angle in radians from which the base pair of a track is no longer replaced by a wider one. 1.5
+            degrees by default. In trials, replacing it still later helped some sequences and hurt others.
+        epipolar_gate: Largest Sampson distance of the two observations of a base pair, in normalised image units. 1.5
+            px by default, nearly four times the default noise.
+        outlier: Squared Mahalanobis distance of a point above which its track is given up. More than twice the gate of
+            `robust`, which 5 to 10 % of real tracks fail in a frame: one that fails it narrowly may go on.
+        minimum: Fewest points that must agree on a pose. Higher coasts, and loses the camera, where fewer points are in
+            view; lower takes poses that chance agreement may have made.
+        patience: Frames of coasting in a row after which the camera is lost. Higher bridges longer gaps by prediction
+            alone; lower starts anew sooner, with an unknown scale.
+        robust: Weights against outliers; see `jaxtri.Robust`. Graduated weights need no RANSAC in any frame.
+        point_noise: Noise of each point over `sigma`, from what the feature tracker says of it; None takes `sigma` for
+            all. None by default: learned on five sequences it changes the error on the sixth by no more than chance
+            (`benchmarks/tuning.py`).
+        passes: Linearisations of an update (static). Eight bring the weights of `robust` from their start to their end.
     """
 
-    sigma: Float[Array, ""]  # noise of an image point
-    acceleration: Float[Array, ""]  # of the camera, in median scene depths per frame^2
-    angular_acceleration: Float[Array, ""]  # per frame^2
-    keyframe_flow: Float[Array, ""]  # median flow since the last keyframe that makes a new one
-    keyframe_common: Float[Array, ""]  # ... or fewer common tracks than this
-    keyframe_usable: Float[Array, ""]  # ... or a smaller share of usable ones than this
-    usable_parallax: Float[Array, ""]  # angle from which a base pair may measure
-    fixed_parallax: Float[Array, ""]  # angle from which a base pair stays
-    epipolar_gate: Float[Array, ""]  # largest Sampson distance of a base pair
-    outlier: Float[Array, ""]  # squared Mahalanobis distance above which a track is given up
-    minimum: Float[Array, ""]  # fewest agreeing points of a pose
-    patience: Float[Array, ""]  # frames of coasting after which the camera is lost
+    sigma: Float[Array, ""] = eqx.field(converter=number)
+    acceleration: Float[Array, ""] = eqx.field(converter=number)
+    angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
+    keyframe_flow: Float[Array, ""] = eqx.field(converter=number)
+    keyframe_common: Float[Array, ""] = eqx.field(converter=number)
+    keyframe_usable: Float[Array, ""] = eqx.field(converter=number)
+    usable_parallax: Float[Array, ""] = eqx.field(converter=number)
+    fixed_parallax: Float[Array, ""] = eqx.field(converter=number)
+    epipolar_gate: Float[Array, ""] = eqx.field(converter=number)
+    outlier: Float[Array, ""] = eqx.field(converter=number)
+    minimum: Float[Array, ""] = eqx.field(converter=number)
+    patience: Float[Array, ""] = eqx.field(converter=number)
     robust: ekf.Robust
-    point_noise: PointNoise | None = None  # of a point over sigma
+    point_noise: PointNoise | None = None
     passes: int = eqx.field(static=True, default=8)
 
     @classmethod
     def of(cls, camera: Camera, *, noise_px: Float[Array, ""] | float = 0.4, passes: int = 8) -> "Settings":
-        """The defaults, for a camera whose tracks have `noise_px` of noise in each coordinate."""
+        """The defaults, for a camera whose tracks have a noise of `noise_px` pixels in each coordinate."""
         focal = jnp.sqrt(camera.fx * camera.fy)
         width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
 
         def number(x: float) -> Array:
+            # In the camera's dtype: the fields' own converter takes JAX's default one.
             return jnp.asarray(x, focal.dtype)
 
         return cls(
@@ -88,17 +141,35 @@ class Settings(eqx.Module):
 
 @dataclass(frozen=True)
 class StartSettings:
-    """When a base pair is good enough; see `jaxtri.vision.hypotheses`."""
+    """When a base pair is good enough to start from; see `jaxtri.vision.hypotheses`.
 
-    flow: float = 0.035  # median flow between the two frames, as a share of the image width
-    parallax_deg: float = 1.0  # median angle between the two rays of a point
-    points: int = 20  # fewest tracks that agree on the motion
-    common: float = 0.15  # share of the tracks that must survive; below it a later first frame is taken
-    restart: float = 0.35  # share of a pair's tracks below which a segment ends (inherit, paper)
-    overlap: int = 1  # frames that two segments share (paper)
-    lag: int = 16  # frames that come while a start is worked out beside them; its poses are known after as many
-    eight_point: bool = False  # the 8-point algorithm with RANSAC, as in the paper
-    poselib: bool = False  # hypotheses of PoseLib compete with OpenCV's (extra `init`)
+    Attributes:
+        flow: Median flow between the two frames, as a share of the image width, from which a start is tried. A start on
+            two consecutive frames, as in the paper, has poor depths: in a prototype a single pair had 2.97 times the
+            error of `pnp` then, and 1.9 times with 3.5 % of the width.
+        parallax_deg: Median angle in degrees between the two rays of a point that a start needs. Below it a camera that
+            only turns may look like one that moves. Higher waits longer and starts from better depths.
+        points: Fewest tracks that must agree on the motion. Higher refuses starts that chance agreement may have made.
+        common: Share of the first frame's tracks that must be left in the second. Below it a later frame becomes the
+            first one.
+        restart: Share of a pair's tracks below which a new pair is made (`Base.INHERIT`, `Base.PAPER`). An optimum:
+            higher makes base lines too short, lower leaves too few tracks to measure with.
+        overlap: How many frames back a new pair begins (`Base.PAPER`): 1 takes the frame before, as in the paper.
+        lag: Frames that queue up while a start is worked out in a thread; its poses are known so many frames later. A
+            start takes about 0.1 seconds, less than 16 frames do: no frame waits. 0 waits for every start.
+        eight_point: Start by the 8-point algorithm with RANSAC alone, as in the paper. Off: it fails before a plane.
+        poselib: Let the pose that PoseLib finds compete with those of OpenCV. Off: it needs the extra `init`.
+    """
+
+    flow: float = 0.035
+    parallax_deg: float = 1.0
+    points: int = 20
+    common: float = 0.15
+    restart: float = 0.35
+    overlap: int = 1
+    lag: int = 16
+    eight_point: bool = False
+    poselib: bool = False
 
     @classmethod
     def of(cls, base: Base | str, **changes: Any) -> "StartSettings":
@@ -109,11 +180,21 @@ class StartSettings:
 
 
 class Report(NamedTuple):
-    """What a step says of its frame."""
+    """What a step says of its frame.
 
-    pose: SE3  # world to camera
-    covariance: Float[Array, "6 6"]  # of its error exp(delta) T, (linear, angular) in camera axes, drift included
+    Attributes:
+        pose: World to camera, translation in scene units.
+        covariance: (6, 6) of the pose's error exp(delta) pose, (linear, angular) in camera axes, scene units and
+            radians, the drift included.
+        status: A `Status`, as an integer.
+        keyframe: Whether the frame was made a keyframe.
+        drop: (n,) tracks that are outliers: their slots may be filled anew.
+        diagnostics: What the update found; see `jaxtri.Diagnostics`.
+    """
+
+    pose: SE3
+    covariance: Float[Array, "6 6"]
     status: Int[Array, ""]
     keyframe: Bool[Array, ""]
-    drop: Bool[Array, " n"]  # tracks that are outliers: their slots may be filled anew
+    drop: Bool[Array, " n"]
     diagnostics: ekf.Diagnostics
