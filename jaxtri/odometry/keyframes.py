@@ -17,20 +17,27 @@ from jaxtri.geometry.pose import identity
 
 
 class Keyframes(NamedTuple):
-    """A ring of k poses, the newest overwriting the oldest, with the joint covariance of their errors."""
+    """A ring of k poses, the newest overwriting the oldest, with the joint covariance of their errors.
 
-    poses: SE3  # (k,) world to camera
-    made: Int[Array, ""]  # how many were made so far
-    covariance: Float[Array, "s s"]  # s = 6k; left perturbations (linear, angular), each in its own camera axes
+    Attributes:
+        poses: (k,) world to camera.
+        made: How many keyframes were made so far.
+        covariance: (s, s), s = 6 k, of the errors of all poses: left perturbations (linear, angular), each in the axes
+            of its own camera, scene units and radians.
+    """
+
+    poses: SE3
+    made: Int[Array, ""]
+    covariance: Float[Array, "s s"]
 
     @property
     def slot(self) -> Int[Array, ""]:
-        """Where the next one goes."""
+        """Place in the ring that the next keyframe takes."""
         return self.made % self.poses.wxyz_xyz.shape[0]
 
 
 def start(one: SE3, two: SE3, covariance: Float[Array, "6 6"], k: int) -> Keyframes:
-    """The first two keyframes: `one` is the gauge, `two` has the given covariance relative to it."""
+    """A ring of `k` keyframes with the first two in it: `one` is the gauge, `two` has the covariance relative to it."""
     dtype = covariance.dtype
     empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), identity(dtype))
     poses = jax.tree.map(lambda e, a, b: e.at[0].set(a).at[1].set(b), empty, one, two)
@@ -43,7 +50,8 @@ def add(
 ) -> tuple[Keyframes, Float[Array, "d s"]]:
     """A new keyframe at the current pose, whose own covariance and sensitivity (first six rows) are given.
 
-    The sensitivity comes back without the keyframe that was overwritten, whose influence is dropped.
+    The sensitivity is returned without its part for the keyframe that was overwritten: what that keyframe's error does
+    to the pose is dropped.
     """
     slot = keyframes.slot
     rows = 6 * slot + jnp.arange(6)
@@ -74,6 +82,6 @@ def carry(
 
 
 def total(own: Float[Array, "6 6"], keyframes: Keyframes, sensitivity: Float[Array, "d s"]) -> Float[Array, "6 6"]:
-    """Covariance of the current pose, its own and what it owes to the keyframes."""
+    """Covariance of the current pose: its `own`, and what the errors of the keyframes add to it."""
     B = sensitivity[:6]
     return own + B @ keyframes.covariance @ B.T

@@ -11,27 +11,42 @@ from jaxtri.filters.model import Mean
 from jaxtri.models.depth import Depth
 from jaxtri.odometry.settings import Settings, Status
 
-LEAST_SHARE = 0.25  # of the tracks measured that must agree for an update to stand
+# Share of the measured tracks that must agree for an update to stand: below it most of what is seen contradicts it.
+LEAST_SHARE = 0.25
+# Standard deviation of the velocity at a start, in scene depths and in radians per frame: at video rate it is all but
+# unknown, and the first update fixes it.
+START_VELOCITY = 0.05
+# Inverse depth (1 / scene units) from which a point counts as infinitely far: what is divided by it stays finite.
+FARTHEST = 1e-9
 
 
 def structure_model(settings: Settings) -> Depth:
-    """The filters of the points, which are gated as the pose's are."""
+    """The model of the filters of the points. Their gate is that of the pose's filter."""
     return Depth.of(settings.sigma, gate=settings.robust.gate)
 
 
 def noise_scale(settings: Settings, quality: Float[Array, "n 2"] | None) -> Float[Array, " n"] | None:
-    """Noise of each point over sigma, where the settings have a model of it."""
+    """Standard deviation of each point over sigma; None where there is no `point_noise` or no `quality`."""
     return None if quality is None or settings.point_noise is None else settings.point_noise.scale(quality)
 
 
 class Measured(NamedTuple):
-    """What a frame gave: the belief to go on with, and what is to be said of it."""
+    """What a frame gave: the belief to go on with, and what is to be said of it.
 
-    belief: ekf.Belief  # the update where enough points agree, else the prediction
-    taken: Bool[Array, ""]  # the update stands
-    coasted: Int[Array, ""]  # frames since the last that did
+    Attributes:
+        belief: The update where enough points agree, else the prediction.
+        taken: Whether `belief` is the update.
+        coasted: Frames since the last one whose update was taken.
+        status: A `Status`, as an integer.
+        drop: (n,) tracks that are outliers.
+        diagnostics: What the update found, taken or not; see `jaxtri.Diagnostics`.
+    """
+
+    belief: ekf.Belief
+    taken: Bool[Array, ""]
+    coasted: Int[Array, ""]
     status: Int[Array, ""]
-    drop: Bool[Array, " n"]  # tracks that are outliers
+    drop: Bool[Array, " n"]
     diagnostics: ekf.Diagnostics
 
 
@@ -46,7 +61,11 @@ def measure(
     coasted: Int[Array, ""],
     scale: Float[Array, " n"] | None,
 ) -> Measured:
-    """Predict from the belief of the frame before, update with the tracks in `mask`, judge by how many agree."""
+    """Predict from the belief of the frame before, update with the tracks in `mask`, judge by how many agree.
+
+    `observed` are normalised image points, `dt` is in frames, `coasted` the frames since the last update that was
+    taken, `scale` what `noise_scale` gives.
+    """
     predicted = ekf.predict(model, before, dt)
     updated, said = ekf.update(
         model, predicted, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
@@ -55,7 +74,7 @@ def measure(
     taken = said.used >= jnp.maximum(settings.minimum, LEAST_SHARE * count)
     belief = jax.tree.map(lambda a, b: jnp.where(taken, a, b), updated, predicted)
     coasted = jnp.where(taken, 0, coasted + 1)
-    # Tracks do not come back: with too few of them left no later frame can agree either.
+    # Tracks do not come back: where too few of them are left, too few will agree in every later frame.
     lost = (coasted > settings.patience) | (count < settings.minimum)
     status = jnp.where(taken, Status.TRACKING, jnp.where(lost, Status.LOST, Status.COASTING)).astype(jnp.int32)
     return Measured(belief, taken, coasted, status, taken & mask & (said.distance > settings.outlier), said)

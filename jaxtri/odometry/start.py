@@ -14,20 +14,36 @@ from jaxtri.odometry import track_pairs
 from jaxtri.odometry.settings import Report, Settings, StartSettings
 from jaxtri.vision.hypotheses import Hypothesis, hypotheses
 
+# Hypotheses up to RIVAL_SHARE times the cost of the best, and RIVAL_MORE, explain the pair about equally well. Before a
+# plane the two poses cost the same; the margin keeps noise from deciding between them.
+RIVAL_SHARE, RIVAL_MORE = 1.5, 50
+BETWEEN = 3  # frames between the pair that decide among rivals: few, since each costs a step of the filter
+TRUNCATED = 16.0  # squared Mahalanobis distance, at four sigmas, from which all transferred points cost the same
+AGREEING = 0.4  # share of the common tracks that must agree on one motion: with fewer another one may explain more
+
 init_tracks = jax.jit(track_pairs.init)
 step_tracks = jax.jit(track_pairs.step)
 
 
 @dataclass(frozen=True)
 class Observations:
-    """The tracks of one frame, normalised, in slots."""
+    """The tracks of one frame, in slots.
+
+    Attributes:
+        index: Number of the frame in the run.
+        time: Seconds.
+        u: (n, 2) normalised image points.
+        visible: (n,) slots that hold a point.
+        ids: (n,) number of the track in each slot.
+        quality: (n, 2) forward-backward error in pixels, and smaller eigenvalue of the patch.
+    """
 
     index: int
     time: float
-    u: np.ndarray  # (n, 2)
-    visible: np.ndarray  # (n,)
-    ids: np.ndarray  # (n,)
-    quality: np.ndarray  # (n, 2) forward-backward error in pixels, smaller eigenvalue of the patch
+    u: np.ndarray
+    visible: np.ndarray
+    ids: np.ndarray
+    quality: np.ndarray
 
     def common(self, other: "Observations") -> np.ndarray:
         """Slots that hold the same track in both frames."""
@@ -35,27 +51,40 @@ class Observations:
 
 
 class Start(NamedTuple):
-    """A base pair, or the reason why there is none yet."""
+    """A base pair, or the reason why there is none yet.
+
+    Attributes:
+        found: The relative pose of the pair, None where there is none yet.
+        reason: Why there is none, for a person to read; empty where there is one.
+    """
 
     found: Hypothesis | None
     reason: str
 
 
 class BasePair(NamedTuple):
-    """A base pair: its frames, the last one that the pair before it measured, and what its pose comes from."""
+    """A base pair and what its pose comes from.
+
+    Attributes:
+        first: Number of its first frame.
+        second: Number of its second frame.
+        last: Number of the last frame that the pair before it measured.
+        found: The relative pose of the two.
+        inside: (n,) tracks that agree with it.
+    """
 
     first: int
     second: int
     last: int
     found: TwoView
-    inside: np.ndarray  # (n,)
+    inside: np.ndarray
 
 
 def find(settings: Settings, start: StartSettings, frames: list[Observations]) -> Start:
     """Relative pose of the first and the last of `frames`, or why it has to wait.
 
-    Of the hypotheses that explain the pair about equally well (before a plane there are two) the frames
-    between decide, by how well the transfer reaches them.
+    Where several hypotheses explain the pair about equally well (before a plane there are two), the frames in between
+    decide: the hypothesis wins whose points are found there where the transfer puts them.
     """
     first, last = frames[0], frames[-1]
     common = first.common(last)
@@ -67,12 +96,13 @@ def find(settings: Settings, start: StartSettings, frames: list[Observations]) -
     )
     if not found:
         return Start(None, "no essential matrix fits the tracks")
-    between = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, 5).round()[1:-1] if 0 < k < len(frames) - 1]
-    rivals = [h for h in found if h.cost < 1.5 * found[0].cost + 50]
+    spread = np.linspace(0, len(frames) - 1, BETWEEN + 2).round()[1:-1]
+    between = [frames[int(k)] for k in spread if 0 < k < len(frames) - 1]
+    rivals = [h for h in found if h.cost < RIVAL_SHARE * found[0].cost + RIVAL_MORE]
     if between and len(rivals) > 1:
         rivals.sort(key=lambda h: h.cost + _transfer_cost(settings, h, first, last, between))
     best = rivals[0]
-    if best.inside.sum() < max(start.points, 0.4 * common.sum()):
+    if best.inside.sum() < max(start.points, AGREEING * common.sum()):
         return Start(None, f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion")
     if not best.parallax_deg >= start.parallax_deg:
         return Start(None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed")
@@ -92,9 +122,10 @@ def _transfer_cost(
     for frame in between:
         visible = first.common(frame) & h.inside
         state, report = hold(settings, state, frame, visible, float(frame.index - before))
-        distance = np.where(np.asarray(report.diagnostics.distance) < 16, report.diagnostics.distance, 16.0)
+        found = np.asarray(report.diagnostics.distance)
+        distance = np.where(found < TRUNCATED, found, TRUNCATED)
         measured = visible & np.asarray(state.tracks.usable)
-        cost += float(distance[measured].sum()) + 16.0 * float((visible & ~measured).sum())
+        cost += float(distance[measured].sum()) + TRUNCATED * float((visible & ~measured).sum())
         before = frame.index
     return cost
 
@@ -104,7 +135,8 @@ def fill(
 ) -> tuple[track_pairs.State, list[tuple[Observations, Report]]]:
     """Set up the tracker on the first and last of `frames`, whose relative pose is given, and run it over them.
 
-    Reports of all frames but the first, whose pose is `world`.
+    `world` is the pose of the first frame, `dt` the time of each other frame since the one before, in frames. Returns
+    the state at the last frame, and the reports of all frames but the first.
     """
     first, last = frames[0], frames[-1]
     common = first.common(last)

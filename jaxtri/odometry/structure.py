@@ -10,14 +10,21 @@ from jaxtyping import Array
 
 from jaxtri.compilation import capacity
 from jaxtri.models.depth import Bank
-from jaxtri.odometry.measuring import structure_model
+from jaxtri.odometry.measuring import FARTHEST, structure_model
 from jaxtri.odometry.settings import Settings
 
-_KNOWN = 3.0  # standard deviations by which an inverse depth is above zero: the depth is known to a third
+_KNOWN = 3.0  # standard deviations by which the inverse depth of a known point is above zero: to a third of itself
 
 
 class Points(NamedTuple):
-    """Triangulated points: `ids` (n,) of their tracks, `xyz` (n, 3) in the world, `covariance` (n, 3, 3)."""
+    """Triangulated points.
+
+    Attributes:
+        ids: (n,) numbers of their tracks.
+        xyz: (n, 3) in the world, scene units.
+        covariance: (n, 3, 3) of each point's own error, scene units squared. The drift of the poses and of the scale,
+            which all points share, is not in it.
+    """
 
     ids: np.ndarray
     xyz: np.ndarray
@@ -31,11 +38,11 @@ def no_points() -> Points:
 
 @jax.jit
 def _world_points(bank: Bank, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """World points of a bank, the covariance of each, and which are known."""
+    """World points (n, 3) of a bank, the covariance of each, and which of them are known well enough to be shown."""
     points, covariance = structure_model(settings).world(bank)
 
     def one(X: Array, C: Array) -> tuple[Array, Array]:
-        w = jnp.where(jnp.abs(X[3]) > 1e-9, X[3], 1e-9)
+        w = jnp.where(jnp.abs(X[3]) > FARTHEST, X[3], FARTHEST)
         J = jnp.concatenate([jnp.eye(3, dtype=X.dtype), -(X[:3] / w)[:, None]], axis=1) / w
         return X[:3] / w, J @ C @ J.T
 
@@ -44,10 +51,15 @@ def _world_points(bank: Bank, settings: Settings) -> tuple[jax.Array, jax.Array,
 
 @dataclass
 class Structure:
-    """The points of a bank whose tracks have ended, kept as they were until they are asked for."""
+    """The points of tracks that have ended, kept as they were until they are asked for.
+
+    Attributes:
+        settings: Those of the run.
+        kept: For each time that tracks ended, their points and the numbers of the tracks (n,).
+    """
 
     settings: Settings
-    kept: list[tuple[Bank, np.ndarray]] = field(default_factory=list)  # points and the numbers of their tracks
+    kept: list[tuple[Bank, np.ndarray]] = field(default_factory=list)
 
     def of(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> Points:
         """The known points of the `good` slots."""
@@ -61,12 +73,12 @@ class Structure:
             self.kept.append((jax.tree.map(lambda x: np.asarray(x)[good], bank), ids[good]))
 
     def ended(self) -> Points:
-        """The points that were kept since the last call."""
+        """The points that were kept since the last call of this method."""
         if not self.kept:
             return no_points()
         banks, ids = zip(*self.kept, strict=True)
         self.kept = []
-        # Filled up to one of a few lengths, each of which compiles once.
+        # Filled up to one of a few lengths: each length is compiled once.
         count = sum(map(len, ids))
         spare = capacity(count) - count
         bank = jax.tree.map(lambda *x: np.concatenate([*x, np.repeat(x[0][:1], spare, axis=0)]), *banks)

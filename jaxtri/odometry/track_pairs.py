@@ -25,34 +25,61 @@ from jaxtri.models.base_pairs import BasePairs, BasePoint, base_lever, base_poin
 from jaxtri.models.depth import Bank
 from jaxtri.models.motion import Twist
 from jaxtri.odometry.keyframes import Keyframes, add, carry, start, total
-from jaxtri.odometry.measuring import measure, median, noise_scale, structure_model
+from jaxtri.odometry.measuring import FARTHEST, START_VELOCITY, measure, median, noise_scale, structure_model
 from jaxtri.odometry.settings import Report, Settings
+
+# Standard deviation of the first pose, in scene depths and radians. It is the gauge, so this is as good as exact, far
+# below what any image tells; at zero its components would have no scale.
+GAUGE = 1e-6
 
 
 class Tracks(NamedTuple):
-    """What is known of the track in each slot."""
+    """What is known of the track in each slot.
 
-    first: Float[Array, "n 2"]  # observation in its first base frame
-    slots: Int[Array, "n 2"]  # keyframes of its two base frames; -1: none yet, or no longer kept
-    base: BasePoint  # (n, 4), (n, 4, 4)
-    lever: Float[Array, "n 4 12"]  # derivative of the point with respect to the errors of the two base poses
-    usable: Bool[Array, " n"]  # `base` may measure
-    fixed: Bool[Array, " n"]  # `base` stays
+    Attributes:
+        first: (n, 2) normalised image point of each track in its first base frame.
+        slots: (n, 2) places in the ring of keyframes of the two base frames; -1 where there is none yet, or where the
+            keyframe is no longer kept.
+        base: The base point of each track: (n, 4) and (n, 4, 4).
+        lever: (n, 4, 12) derivative of the base point with respect to the errors of the two base poses.
+        usable: (n,) tracks whose `base` may measure.
+        fixed: (n,) tracks whose `base` is no longer replaced.
+    """
+
+    first: Float[Array, "n 2"]
+    slots: Int[Array, "n 2"]
+    base: BasePoint
+    lever: Float[Array, "n 4 12"]
+    usable: Bool[Array, " n"]
+    fixed: Bool[Array, " n"]
 
 
 class State(NamedTuple):
-    """What is carried from frame to frame."""
+    """What is carried from frame to frame.
+
+    Attributes:
+        belief: Pose and twist of the camera, with the covariance (12, 12) of their errors.
+        tracks: What is known of the track in each slot.
+        keyframes: The base frames that are kept.
+        sensitivity: (12, s) derivative of the error of `belief` with respect to the s = 6 k errors of the keyframes.
+        seen: (n, 2) normalised image points of the last keyframe.
+        held: (n,) tracks that have not broken since the last keyframe.
+        depth: Median depth of the scene, scene units.
+        coasted: Frames since the last update that was taken.
+        structure: A point per track, refined in every frame given the pose.
+        born: (n,) tracks whose point stands in `structure`.
+    """
 
     belief: ekf.Belief[Twist]
     tracks: Tracks
     keyframes: Keyframes
-    sensitivity: Float[Array, "12 s"]  # of the error of `belief` to the s = 6k of the keyframes
-    seen: Float[Array, "n 2"]  # observations of the last keyframe
-    held: Bool[Array, " n"]  # tracks unbroken since then
-    depth: Float[Array, ""]  # median depth of the scene
-    coasted: Int[Array, ""]  # frames since the last update
-    structure: Bank  # a point per track, refined in every frame given the pose
-    born: Bool[Array, " n"]  # tracks whose point stands in `structure`
+    sensitivity: Float[Array, "12 s"]
+    seen: Float[Array, "n 2"]
+    held: Bool[Array, " n"]
+    depth: Float[Array, ""]
+    coasted: Int[Array, ""]
+    structure: Bank
+    born: Bool[Array, " n"]
 
 
 def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
@@ -72,9 +99,10 @@ def init(
 ) -> State:
     """The state at the first of two base frames whose relative pose X2 = pose X1 is known.
 
-    `mask` marks the slots seen in both. `covariance` is that of the left perturbation of `pose`, zero by
-    default. `world` is the pose of the first frame (the identity by default).
-    The frames between the two, and the second, follow by `step` with `hold=True`.
+    `first` and `second` are normalised image points in slots, `mask` marks the slots seen in both. `covariance` is that
+    of the left perturbation of `pose`, zero by default. `world` is the pose of the first frame (the identity by
+    default). `keyframes` is how many of them are kept. Give the frames between the two, and the second, to `step` with
+    `hold=True`.
     """
     dtype = first.dtype
     one = identity(dtype) if world is None else jax.tree.map(lambda x: x.astype(dtype), world)
@@ -86,8 +114,8 @@ def init(
     depth = median(1 / jnp.where(good, base.point[:, 3], 1.0), good)
     covariance = jnp.zeros((6, 6), dtype) if covariance is None else covariance
     kept = start(one, two, covariance, keyframes)
-    # The first pose is the gauge; the velocity is all but unknown.
-    sd = jnp.repeat(jnp.stack([1e-6 * depth, jnp.asarray(1e-6, dtype), 0.05 * depth, jnp.asarray(0.05, dtype)]), 3)
+    fixed, unknown = jnp.asarray(GAUGE, dtype), jnp.asarray(START_VELOCITY, dtype)
+    sd = jnp.repeat(jnp.stack([GAUGE * depth, fixed, START_VELOCITY * depth, unknown]), 3)
     belief = ekf.Belief(Twist(one, jnp.zeros(6, dtype)), jnp.diag(sd**2))
     slots = jnp.stack([jnp.where(mask, 0, -1), jnp.where(good, 1, -1)], axis=-1).astype(jnp.int32)
     tracks = Tracks(first, slots, base, lever, good, good)
@@ -189,7 +217,7 @@ def step(
 
     inverse = tracks.base.point[:, 3]
     depths = tracks.base.point[:, :3] @ belief.mean.pose.rotation().as_matrix()[2]
-    depths = depths / jnp.where(jnp.abs(inverse) > 1e-9, inverse, 1e-9) + belief.mean.pose.translation()[2]
+    depths = depths / jnp.where(jnp.abs(inverse) > FARTHEST, inverse, FARTHEST) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
     plain = State(belief, tracks, state.keyframes, sensitivity, state.seen, held, depth, found.coasted, structure, born)
     new = jax.lax.cond(keyframe, lambda: _rebase(settings, plain, observed, visible), lambda: plain)
