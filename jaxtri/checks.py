@@ -25,6 +25,7 @@ M = TypeVar("M")
 
 NORMALISED = 10.0  # a normalised coordinate is the tangent of an angle off the axis: this is 84 degrees
 NORMALISED_SIGMA = 0.03  # noise of a normalised image point: 20 pixels of a focal length of 700
+PIXELS = 3.0  # image points that all lie within so many pixels of the corner are none
 SPREAD = 1e-6  # of a covariance's scaled eigenvalues, that may lie below zero by rounding
 
 _UNITS = "models work in normalised image units: pixels over the focal length, by camera.to_normalised"
@@ -64,15 +65,16 @@ def _shaped(name: str, array: np.ndarray, shape: tuple[int | str, ...]) -> np.nd
 
 def positive(name: str, value: Any, units: str = "") -> None:
     """Raise `InputError` unless all of it is finite and above zero, where there are values."""
-    if _known(value) and not (np.isfinite(found := np.asarray(value)).all() and (found > 0).all()):
+    found = concrete(value)
+    if found is not None and not (np.isfinite(found).all() and (found > 0).all()):
         raise InputError(f"{name} is {found}; it must be a positive, finite number{units}")
 
 
 def covariance(name: str, value: Array) -> None:
     """Raise `InputError` unless it is finite, symmetric and without negative eigenvalues, where there are values."""
-    if not _known(value):
+    if (given := concrete(value)) is None:
         return
-    P = np.asarray(value, np.float64)
+    P = given.astype(np.float64)
     if not np.isfinite(P).all():
         raise InputError(f"{name} is not finite")
     sd = np.sqrt(np.maximum(np.einsum("...ii->...i", P), 0))
@@ -81,29 +83,41 @@ def covariance(name: str, value: Array) -> None:
     if np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(initial=0) > 1e-3:
         raise InputError(f"{name} is not symmetric; give (C + C.T) / 2 if that is by rounding")
     lowest = np.linalg.eigvalsh(scaled).min(initial=0)
-    if lowest < -SPREAD * np.sqrt(np.finfo(np.asarray(value).dtype).eps / np.finfo(np.float64).eps):
+    if lowest < -SPREAD * np.sqrt(np.finfo(given.dtype).eps / np.finfo(np.float64).eps):
         raise InputError(f"{name} has a negative eigenvalue ({lowest:.3g} in units of its variances): it is none")
 
 
 def image_points(name: str, observed: Any, mask: Any = None) -> None:
     """Warn where what should be normalised image points are clearly pixels."""
-    if _known(observed) and (mask is None or _known(mask)):
-        values = np.asarray(observed)
-        size = np.abs(values if mask is None else values[np.asarray(mask)])
+    values, seen = concrete(observed), concrete(mask)
+    if values is not None and (mask is None or seen is not None):
+        size = np.abs(values if seen is None else values[seen])
         if size.size and np.nanmedian(size) > NORMALISED:
             warnings.warn(f"{name} has values like {np.nanmedian(size):.3g}: {_UNITS}", UnitsWarning, stacklevel=4)
+
+
+def pixel_points(name: str, values: np.ndarray) -> None:
+    """Warn where what should be pixels is clearly normalised: many points, all within a pixel or two of the corner."""
+    finite = values[np.isfinite(values)]
+    if len(finite) >= 16 and np.abs(finite).max() < PIXELS:
+        message = f"{name} are all within {np.abs(finite).max():.3g} of the corner: give pixels, not normalised points"
+        warnings.warn(message, UnitsWarning, stacklevel=4)
 
 
 def image_noise(name: str, sigma: Any) -> None:
     """Raise where the noise of a normalised image point cannot be one; warn where it is clearly in pixels."""
     positive(name, sigma, " in normalised image units: noise_px / focal length")
-    if _known(sigma) and np.asarray(sigma).max() > NORMALISED_SIGMA:
-        message = f"{name} is {np.asarray(sigma).max():.3g}: {_UNITS}; give noise_px / focal length"
+    found = concrete(sigma)
+    if found is not None and found.max() > NORMALISED_SIGMA:
+        message = f"{name} is {found.max():.3g}: {_UNITS}; give noise_px / focal length"
         warnings.warn(message, UnitsWarning, stacklevel=4)
 
 
-def _known(value: Any) -> bool:
-    return value is not None and not isinstance(value, Tracer) and hasattr(value, "__array__")
+def concrete(value: Any) -> np.ndarray | None:
+    """The value as a NumPy array; None where there is none: under `jit`, `grad` and `vmap`, and of None itself."""
+    if isinstance(value, Tracer) or not isinstance(value, bool | int | float | np.ndarray | np.generic | jax.Array):
+        return None
+    return np.asarray(value)
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -208,7 +222,7 @@ def _judge(arguments: Mapping[str, Any]) -> None:
     for name, value in arguments.items():
         if name in ("passes", "block", "k") and isinstance(value, int) and value < 1:
             raise InputError(f"{name} is {value}; give at least 1")
-        if name == "dt" and _known(value) and not np.isfinite(np.asarray(value)).all():
+        if name == "dt" and (steps := concrete(value)) is not None and not np.isfinite(steps).all():
             raise InputError("dt is not finite: give the time since the frame before, one for all or one a frame")
         for field in ("covariance", "own"):
             part = getattr(value, field, None)

@@ -7,8 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtri.checks import concrete
 from jaxtri.errors import CameraError
 
 # Newton doubles the radius at most, from 1: enough steps for 89.9 degrees off the axis of a fisheye lens,
@@ -135,6 +137,20 @@ class Camera(eqx.Module):
     width: int | None = eqx.field(static=True, default=None)
     height: int | None = eqx.field(static=True, default=None)
 
+    def __check_init__(self) -> None:
+        """Raise `CameraError` naming what is not finite, or not positive where it must be; where there are values."""
+        for name in ("fx", "fy", "cx", "cy", "skew"):
+            value = concrete(getattr(self, name))
+            if value is not None and not np.isfinite(value).all():
+                raise CameraError(f"{name} is {value}; it must be a finite number of pixels")
+        for name in ("fx", "fy", "width", "height"):
+            value = concrete(getattr(self, name))
+            if value is not None and not (value > 0).all():
+                raise CameraError(f"{name} is {value}; it must be a positive number of pixels")
+        coefficients = None if self.distortion is None else concrete(self.distortion.coefficients)
+        if coefficients is not None and not np.isfinite(coefficients).all():
+            raise CameraError(f"distortion is {coefficients}; its coefficients must be finite")
+
     @classmethod
     def from_parameters(
         cls,
@@ -149,20 +165,11 @@ class Camera(eqx.Module):
         height: int | None = None,
         dtype: Any = None,
     ) -> "Camera":
-        """A camera from numbers, checked; `dtype` defaults to JAX's default float.
+        """A camera from numbers; `dtype` defaults to JAX's default float.
 
         Raises `CameraError` naming the parameter that is not finite, or not positive where it must be.
-        Host only.
         """
         dtype = jnp.result_type(float) if dtype is None else dtype
-        for name, value in {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}.items():
-            if not math.isfinite(value):
-                raise CameraError(f"{name} is {value}; it must be a finite number of pixels")
-        for name, value in {"fx": fx, "fy": fy, "width": width, "height": height}.items():
-            if value is not None and not value > 0:
-                raise CameraError(f"{name} is {value}; it must be a positive number of pixels")
-        if distortion is not None and not bool(jnp.isfinite(distortion.coefficients).all()):
-            raise CameraError(f"distortion is {distortion.coefficients}; its coefficients must be finite")
         fx_, fy_, cx_, cy_, skew_ = jnp.asarray([fx, fy, cx, cy, skew], dtype)
         return cls(fx_, fy_, cx_, cy_, skew_, distortion, width, height).astype(dtype)
 

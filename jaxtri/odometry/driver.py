@@ -16,7 +16,7 @@ import numpy as np
 from jaxlie import SE3
 from jaxtyping import ArrayLike
 
-from jaxtri.checks import booleans, numbers
+from jaxtri.checks import booleans, image_noise, numbers, pixel_points
 from jaxtri.compilation import capacity
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.estimation.two_view import scaled
@@ -110,6 +110,7 @@ class Odometry(Archived):
             raise InputError(f"capacity is {self.capacity}; give the most tracks that are followed at once, or None")
         self.base = Base(self.base)
         self.settings = self.settings or Settings.of(self.camera)
+        image_noise("settings.sigma", self._settings.sigma)
         self.start = self.start or StartSettings.of(self.base)
         self._recorder = Recorder(self.record)
 
@@ -228,6 +229,8 @@ class Odometry(Archived):
         """The frame as the filters take it, its tracks in slots, and the number of each row."""
         z = numbers("pixels", pixels, ("n", 2))
         seen = booleans("visible", visible, (len(z),))
+        if not self.poses:
+            pixel_points("pixels", z[seen])
         rows = np.arange(len(z)) if ids is None else numbers("ids", ids, (len(z),), np.int64)
         known = None if quality is None else numbers("quality", quality, (len(z), 2))
         if len(rows) and rows[seen].min(initial=0) < 0:

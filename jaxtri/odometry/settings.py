@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri.checks import number
+from jaxtri.checks import number, positive
 from jaxtri.errors import InputError
 from jaxtri.filters import ekf
 from jaxtri.geometry.camera import Camera
@@ -113,7 +113,13 @@ class Settings(eqx.Module):
 
     @classmethod
     def of(cls, camera: Camera, *, noise_px: Float[Array, ""] | float = 0.4, passes: int = 8) -> "Settings":
-        """The defaults, for a camera whose tracks have a noise of `noise_px` pixels in each coordinate."""
+        """The defaults, for a camera whose tracks have a noise of `noise_px` pixels in each coordinate.
+
+        Raises `InputError` where `noise_px` is not positive or `passes` is below 1.
+        """
+        positive("noise_px", noise_px, " of pixels")
+        if passes < 1:
+            raise InputError(f"passes is {passes}; give at least 1")
         focal = jnp.sqrt(camera.fx * camera.fy)
         width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
 
