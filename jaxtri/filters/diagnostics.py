@@ -43,6 +43,17 @@ class Robust(eqx.Module):
         return (1 + distance / c) ** -2
 
 
+def weigh(
+    robust: Robust | None, distance: Float[Array, " n"], mask: Bool[Array, " n"], k: Int[Array, ""], passes: int
+) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """Weights of all items in pass k of `passes`, and which of them the gate leaves (the last pass: these alone)."""
+    if robust is None:
+        return mask.astype(distance.dtype), mask
+    used = mask & (distance < robust.gate.astype(distance.dtype))
+    weights = jnp.where(mask, robust.weights(distance, k, passes), 0.0)
+    return jnp.where((k == passes - 1) & ~used, 0.0, weights), used
+
+
 def count_passes(passes: int | None, robust: Robust | None) -> int:
     """How often an update linearises: as asked, or 4, or as often as the robust weights need."""
     if passes is not None:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxtri.checks import checked
 from jaxtri.filters import projective
-from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown
+from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown, weigh
 from jaxtri.filters.linalg import Inverse, Prior, linearised, whiten
 from jaxtri.filters.masks import replace_masked, safe_root, stand_in
 from jaxtri.filters.model import Belief, Dynamics, Mean, Model, change_of_origin, predict
@@ -157,6 +157,48 @@ class _Pass(NamedTuple):
     nis: Float[Array, ""]
 
 
+class _Passes(NamedTuple):
+    """The passes of an update: Gauss-Newton on the posterior, the weights coming down."""
+
+    at: Callable[[Array], Evidence]  # what the frame says at an error of the prior's mean
+    prior: Prior
+    mask: Bool[Array, " n"]
+    considered: Bool[np.ndarray | Array, " d"] | None
+    robust: Robust | None
+    linearisations: int
+
+    def correct(self, error: Float[Array, " d"]) -> Float[Array, " d"]:
+        """The error without its considered components."""
+        return error if self.considered is None else jnp.where(self.considered, 0.0, error)
+
+    def run(self) -> _Pass:
+        """The last of them."""
+        P, support = self.prior.P, self.prior.support
+        # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
+        zero, matrix = jnp.zeros((), P.dtype), jnp.zeros((len(support), len(support)), P.dtype)
+        valid, each = self.mask.astype(P.dtype), jnp.zeros(len(self.mask), P.dtype)
+        first = _Pass(jnp.zeros(len(P), P.dtype), matrix, Inverse(matrix, zero), valid, self.mask, each, zero, zero)
+        return jax.lax.fori_loop(0, self.linearisations, lambda k, found: self._one(k, found.optimal), first)
+
+    def _one(self, k: Array, before: Array) -> _Pass:
+        delta, support = self.correct(before), self.prior.support
+        evidence = self.at(delta)
+        weights, used = weigh(self.robust, evidence.distance, self.mask, k, self.linearisations)
+        A, b = evidence.normal_equations(weights)
+        at = delta[support]
+        b = b + A @ at
+        inverse = self.prior.inverse(A)
+        optimal = self.prior.error(inverse, b)
+        # nu' S^-1 nu without S: by the solution's own normal equations, free of cancellation.
+        best = optimal[support]
+        left = distance = evidence.distance_after(best - at)
+        if self.considered is not None:
+            distance = evidence.distance_after(self.correct(optimal)[support] - at)
+        nis = jnp.sum(jnp.where(used, left, 0.0)) + best @ (b - A @ best)
+        log_det = jnp.sum(jnp.where(used, evidence.log_det, 0.0))
+        return _Pass(optimal, A, inverse, weights, used, distance, log_det, nis)
+
+
 @checked
 def update(
     model: Model[Mean],
@@ -181,60 +223,30 @@ def update(
     sigma is not positive; warns (`UnitsWarning`) where normalised image points are clearly pixels.
     """
     P, mean = belief.covariance, belief.mean
-    dtype, d = P.dtype, P.shape[0]
     mask = jnp.ones(len(observed), bool) if mask is None else mask
-    passes = count_passes(passes, robust)
     linearise, support, components = _measuring(model, belief, items, mask)
     noise_scale, observed = replace_masked(mask, noise_scale, 1.0), replace_masked(mask, observed, 0.0)
-    valid, prior = mask.astype(dtype), Prior.of(P, support)
     considered = getattr(model, "considered", None)
-
-    def correct(error: Array) -> Array:
-        return error if considered is None else jnp.where(considered, 0.0, error)
-
-    def iterate(k: Array, before: Array) -> _Pass:
-        delta = correct(before)
-        evidence = linearise(mean, delta, observed, mask, noise_scale)
-        weights, used = valid, mask
-        if robust is not None:
-            distance = evidence.distance
-            weights = valid * robust.weights(distance, k, passes)
-            used = mask & (distance < robust.gate.astype(dtype))
-            weights = jnp.where((k == passes - 1) & ~used, 0.0, weights)
-        A, b = evidence.normal_equations(weights)
-        at = delta[support]
-        b = b + A @ at
-        inverse = prior.inverse(A)
-        optimal = prior.error(inverse, b)
-        # nu' S^-1 nu without S: by the solution's own normal equations, free of cancellation.
-        best = optimal[support]
-        left = distance = evidence.distance_after(best - at)
-        if considered is not None:
-            distance = evidence.distance_after(correct(optimal)[support] - at)
-        nis = jnp.sum(jnp.where(used, left, 0.0)) + best @ (b - A @ best)
-        log_det = jnp.sum(jnp.where(used, evidence.log_det, 0.0))
-        return _Pass(optimal, A, inverse, weights, used, distance, log_det, nis)
-
-    # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
-    zero, matrix, each = (jnp.zeros(shape, dtype) for shape in ((), (len(support), len(support)), len(mask)))
-    last = _Pass(jnp.zeros(d, dtype), matrix, Inverse(matrix, zero), valid, mask, each, zero, zero)
-    last = jax.lax.fori_loop(0, passes, lambda k, found: iterate(k, found.optimal), last)
-    optimal, A, inverse, weights, used, distance, noise_log_det, nis = last
-    covariance = prior.posterior(A, inverse)
-    final = correct(optimal)
+    passes_ = _Passes(
+        lambda delta: linearise(mean, delta, observed, mask, noise_scale),
+        Prior.of(P, support),
+        mask,
+        considered,
+        robust,
+        count_passes(passes, robust),
+    )
+    last = passes_.run()
+    covariance, final = passes_.prior.posterior(last.A, last.inverse), passes_.correct(last.optimal)
     if considered is not None:
         # The gain of all other components is the optimal one, and so is what they have in common with these.
         covariance = jnp.where(jnp.logical_and.outer(considered, considered), P, covariance)
-
     moved = model.retract(mean, final)
     # The error now lives at the new mean: carry the covariance there.
     reset = change_of_origin(model, mean, final, moved)
     posterior = Belief(moved, reset @ covariance @ reset.T)
-
-    diagnostics = Diagnostics.of(
-        nis, inverse.log_det + noise_log_det, components, mask, used, weights=weights, distance=distance
-    )
-    return unless_overflown(belief, posterior, diagnostics)[:2]
+    log_det = last.inverse.log_det + last.log_det
+    said = Diagnostics.of(last.nis, log_det, components, mask, last.used, weights=last.weights, distance=last.distance)
+    return unless_overflown(belief, posterior, said)[:2]
 
 
 @checked

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxtri.checks import checked
-from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown
+from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown, weigh
 from jaxtri.filters.linalg import posterior_error, scales, whiten
 from jaxtri.filters.masks import replace_masked, safe_root, stand_in
 from jaxtri.filters.model import Belief, Dynamics, Mean, change_of_origin, transition
@@ -146,6 +146,75 @@ def _linearise(
     return _Pass(at, item_noise, innovation, W, distance, log_det, D)
 
 
+class _Gain(NamedTuple):
+    """Schmidt's gain at the last linearisation."""
+
+    error: Float[Array, " d"]  # the best one
+    gain: Float[Array, "d n m"]
+    log_det: Float[Array, ""]  # of the innovations' covariance over that of the noise
+    nis: Float[Array, ""]
+
+
+def _schmidt_gain(
+    lin: _Pass,
+    weights: Float[Array, " n"],
+    sensitivity: Float[Array, "d n p"],
+    prior: Float[Array, "d d"],
+    reset: Float[Array, "d d"],
+    centre: Float[Array, " d"],
+) -> _Gain:
+    """The gain of a `prior` about `centre` whose error has the items' errors in it; `reset` takes errors there.
+
+    S = D + G M G' with G = [H, spread C'], C = sensitivity noise, and M = [[P, I], [I, 0]]; O(d) by Woodbury.
+    """
+    d, root = len(prior), safe_root(weights)
+    H, v = lin.whitened(root)
+    v = v - H @ centre
+    cross = jnp.einsum("nmp,npq,dnq->nmd", lin.at.spread, lin.item_noise, sensitivity)
+    cross = jnp.einsum("n,nij,njd->nid", root, lin.whitener, cross).reshape(-1, d) @ reset.T
+    s = scales(prior)
+    G = jnp.concatenate([H * s, cross / s], axis=1)
+    zero, eye = jnp.zeros((d, d), prior.dtype), jnp.eye(d, dtype=prior.dtype)
+    inner = jnp.block([[zero, eye], [eye, -prior / jnp.outer(s, s)]]) + G.T @ G
+    right = jnp.concatenate([jnp.eye(2 * d, d, dtype=prior.dtype), (G.T @ v)[:, None]], axis=1)
+    solved = jnp.linalg.solve(inner, right)
+    nis = v @ v - (G.T @ v) @ solved[:, -1]
+    # K of the whitened, then of the plain measurements.
+    gain = s[:, None] * (solved[:, :-1].T @ G.T)
+    error = centre + gain @ v
+    gain = jnp.einsum("dni,n,nij->dnj", gain.reshape(d, *lin.innovation.shape), root, lin.whitener)
+    return _Gain(error, gain, jnp.linalg.slogdet(inner)[1], nis)
+
+
+def _posterior(
+    model: ConsiderModel[Mean],
+    belief: ConsiderBelief[Mean],
+    mean: Mean,
+    reset: Float[Array, "d d"],
+    lin: _Pass,
+    found: _Gain,
+    absorbed: Bool[Array, " n"] | None,
+) -> tuple[ConsiderBelief[Mean], ItemUpdate]:
+    """The belief after the gain, and what the frame says of the items; `mean` is where it was linearised."""
+    # The error now lives at the new mean, close by.
+    final = model.retract(mean, found.error)
+    shift = change_of_origin(model, mean, found.error, final)
+    gain = _times(shift, found.gain)
+    keep = (shift - _rows(gain) @ lin.at.jacobian.reshape(-1, len(reset))) @ reset
+    sensitivity = _times(keep, belief.sensitivity)
+    pulled = sensitivity - jnp.einsum("dnm,nmp->dnp", gain, lin.at.spread)
+    own = keep @ belief.own @ keep.T
+    said = lin.item_update(found.error)
+    fresh = jnp.square(model.sigma) * gain
+    if absorbed is not None:
+        new = jnp.einsum("dnp,npm->dnm", sensitivity, said.gain) - gain
+        fresh = jnp.where(absorbed[:, None], jnp.einsum("dnm,nmk->dnk", new, lin.noise), fresh)
+        gain = jnp.where(absorbed[:, None], new, gain)
+        pulled = jnp.where(absorbed[:, None], sensitivity, pulled)
+    own = own + _rows(fresh) @ _rows(gain).T
+    return ConsiderBelief(final, (own + own.T) / 2, pulled), said
+
+
 @checked
 def update(
     model: ConsiderModel[Mean],
@@ -168,87 +237,45 @@ def update(
     The passes before the last seek the point of linearisation and take the items' errors for new; the last
     one's gain is Schmidt's.
     """
-    dtype, d = belief.own.dtype, belief.own.shape[0]
     mask = jnp.ones(len(observed), bool) if mask is None else mask
     passes = count_passes(passes, robust)
     present = mask if absorb is None else mask | absorb
     item_noise = model.item_noise(belief.mean, items)
     items, observed = stand_in(present, items), replace_masked(present, observed, 0.0)
-    valid = mask.astype(dtype)
-    still = jnp.zeros((mask.size, belief.sensitivity.shape[2]), dtype)
     P = belief.covariance(item_noise)
 
-    def weigh(lin: _Pass, k: Array) -> Array:
-        return valid if robust is None else valid * robust.weights(lin.distance, k, passes)
-
-    def prior_at(mean: Mean) -> tuple[Array, Array]:
-        """The change to the errors of another mean, and the prior's centre in these."""
+    def at(mean: Mean, moved: Array, k: Array) -> tuple[Array, Array, _Pass, Array, Array]:
+        """The change to the errors of another mean, the prior's centre in these, and the linearisation there."""
         delta = model.local(belief.mean, mean)
         reset = change_of_origin(model, belief.mean, delta, mean)
-        return reset, -reset @ delta
+        lin = _linearise(model, mean, items, moved, item_noise, observed, present)
+        return reset, -reset @ delta, lin, *weigh(robust, lin.distance, mask, k, passes)
 
     def iterate(k: Array, carry: tuple[Mean, Array]) -> tuple[Mean, Array]:
         mean, moved = carry
-        reset, centre = prior_at(mean)
-        lin = _linearise(model, mean, items, moved, item_noise, observed, present)
-        weights = weigh(lin, k)
+        reset, centre, lin, weights, _ = at(mean, moved, k)
         H, v = lin.whitened(safe_root(weights))
         e = centre + posterior_error(reset @ P @ reset.T, H.T @ H, H.T @ (v - H @ centre))
         # An outlier says nothing of its item, which it might move to where the measurement is singular.
         believed = jnp.where(mask, weights, 1.0)[:, None]
         return model.retract(mean, e), believed * lin.item_update(e).moved
 
+    still = jnp.zeros((mask.size, belief.sensitivity.shape[2]), belief.own.dtype)
     mean, moved = jax.lax.fori_loop(0, passes - 1, iterate, (belief.mean, still))
-    reset, centre = prior_at(mean)
-    lin = _linearise(model, mean, items, moved, item_noise, observed, present)
-    weights, used = weigh(lin, jnp.asarray(passes - 1)), mask
-    if robust is not None:
-        used = mask & (lin.distance < robust.gate.astype(dtype))
-        weights = jnp.where(used, weights, 0.0)
-    root = safe_root(weights)
-    H, v = lin.whitened(root)
-    v = v - H @ centre
-    # S = D + G M G' with G = [H, spread C'], C = sensitivity noise, and M = [[P, I], [I, 0]]; O(d) by Woodbury.
-    cross = jnp.einsum("nmp,npq,dnq->nmd", lin.at.spread, item_noise, belief.sensitivity)
-    cross = jnp.einsum("n,nij,njd->nid", root, lin.whitener, cross).reshape(-1, d) @ reset.T
-    prior = reset @ P @ reset.T
-    s = scales(prior)
-    G = jnp.concatenate([H * s, cross / s], axis=1)
-    zero, eye = jnp.zeros((d, d), dtype), jnp.eye(d, dtype=dtype)
-    inner = jnp.block([[zero, eye], [eye, -prior / jnp.outer(s, s)]]) + G.T @ G
-    solved = jnp.linalg.solve(inner, jnp.concatenate([jnp.eye(2 * d, d, dtype=dtype), (G.T @ v)[:, None]], axis=1))
-    nis = v @ v - (G.T @ v) @ solved[:, -1]
-    # K of the whitened, then of the plain measurements.
-    gain = s[:, None] * (solved[:, :-1].T @ G.T)
-    e = centre + gain @ v
-    gain = jnp.einsum("dni,n,nij->dnj", gain.reshape(d, *observed.shape), root, lin.whitener)
+    reset, centre, lin, weights, used = at(mean, moved, jnp.asarray(passes - 1))
+    found = _schmidt_gain(lin, weights, belief.sensitivity, reset @ P @ reset.T, reset, centre)
+    absorbed = absorb
+    if absorb is not None and robust is not None:
+        absorbed = absorb & (lin.distance < robust.gate.astype(lin.distance.dtype))
+    posterior, said = _posterior(model, belief, mean, reset, lin, found, absorbed)
 
-    # The error now lives at the new mean, close by.
-    final = model.retract(mean, e)
-    shift = change_of_origin(model, mean, e, final)
-    gain = _times(shift, gain)
-    keep = (shift - _rows(gain) @ lin.at.jacobian.reshape(-1, d)) @ reset
-    sensitivity = _times(keep, belief.sensitivity)
-    pulled = sensitivity - jnp.einsum("dnm,nmp->dnp", gain, lin.at.spread)
-    own = keep @ belief.own @ keep.T
-    said = lin.item_update(e)
-    absorbed = jnp.zeros_like(mask)
-    fresh = jnp.square(model.sigma) * gain
-    if absorb is not None:
-        absorbed = absorb if robust is None else absorb & (lin.distance < robust.gate.astype(dtype))
-        new = jnp.einsum("dnp,npm->dnm", sensitivity, said.gain) - gain
-        fresh = jnp.where(absorbed[:, None], jnp.einsum("dnm,nmk->dnk", new, lin.noise), fresh)
-        gain = jnp.where(absorbed[:, None], new, gain)
-        pulled = jnp.where(absorbed[:, None], sensitivity, pulled)
-    own = own + _rows(fresh) @ _rows(gain).T
-    posterior = ConsiderBelief(final, (own + own.T) / 2, pulled)
-
-    log_det = jnp.linalg.slogdet(inner)[1] + jnp.sum(jnp.where(used, lin.log_det, 0.0))
-    left = lin.innovation - jnp.einsum("nmd,d->nm", lin.at.jacobian, e)
+    log_det = found.log_det + jnp.sum(jnp.where(used, lin.log_det, 0.0))
+    left = lin.innovation - jnp.einsum("nmd,d->nm", lin.at.jacobian, found.error)
     distance = jnp.sum(jnp.einsum("nij,nj->ni", lin.whitener, left) ** 2, axis=-1)
-    nis = nis + jnp.sum(jnp.where(used, 1 - weights, 0.0) * distance)  # every item that is used counts in full
+    nis = found.nis + jnp.sum(jnp.where(used, 1 - weights, 0.0) * distance)  # each that is used counts in full
     diagnostics = Diagnostics.of(nis, log_det, observed.shape[1], mask, used, weights=weights, distance=distance)
     posterior, diagnostics, finite = unless_overflown(belief, posterior, diagnostics)
+    absorbed = jnp.zeros_like(mask) if absorbed is None else absorbed
     moved, gain = replace_masked(absorbed, (said.moved, said.gain), 0.0)
     return posterior, diagnostics, jax.tree.map(lambda x: jnp.where(finite, x, 0), ItemUpdate(moved, gain, lin.at))
 
