@@ -1,20 +1,20 @@
 """The transfer from K base frames: the pose of a camera and of its base frames, and points that stand on these.
 
 The trifocal filter knows a point from a pair of base frames. Here the pair's point goes on: whatever frame is
-made a base frame adds its observation to the point by least squares, given the base poses, which are in the
-state. The structure itself is not: a point moves with the errors of the base poses (`lever`) and has an error
+made a base frame adds its observation to the point by least squares, given the base poses. These are in the
+state, and the structure is not: a point moves with the errors of the base poses (`lever`) and has an error
 of its own, which `jaxtri.schmidt` considers. So a frame costs O(N), no information of a base frame is lost and
 none is counted twice. With the pair alone it is the trifocal filter, to first order.
 
-A lever is that of the point as the current frame corrects it (`slope`): taken where a noisy point stands it
-has an error in common with the innovation, which adds up to a drift of the scale.
+A lever is taken at the point as the current frame corrects it (`slope`). Taken at the noisy point itself it
+would have an error in common with the innovation, which adds up to a drift of the scale.
 
-A point may begin in any base frame, with a prior on its inverse depth. A base frame that makes room for
-another is written as a function of those that stay; what these do not know of it becomes an error of the
-points.
+A point may begin in any base frame, with a prior on its inverse depth. The error of a base frame that makes room for
+another is written as a function of the errors of the base frames that stay. What these do not tell of it becomes an
+error of the points.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.checks import number
 from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
 from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
@@ -31,41 +32,68 @@ from jaxtri.filters.schmidt import ConsiderBelief, Measured
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
 from jaxtri.geometry.pose import local, retract, shear
 from jaxtri.models.motion import Kinematics, Twist, acceleration_noise, from_two_view, twist_noise
+from jaxtri.models.point_noise import SIGMA
 
 
-class Points(NamedTuple):
-    """Homogeneous world points; b = 6 (K - 1) errors of the base poses but the first, which is the world."""
+class BaseFramesPoints(NamedTuple):
+    """World points that move with the base poses.
+
+    b = 6 (K - 1) is the number of errors of the base poses: all but the first, which is the world.
+
+    Attributes:
+        point: (n, 4) homogeneous, scene units.
+        basis: (n, 4, 3) where a point's own error takes it: the error is that of its image point (normalised) and
+            inverse depth where it was first seen.
+        lever: (n, 4, b) where the errors of the base poses take it.
+        slope: (n, 4, b) derivative of the lever with respect to the inverse depth.
+        noise: (n, 3, 3) covariance of a point's own error, over sigma^2.
+    """
 
     point: Float[Array, "n 4"]
-    basis: Float[Array, "n 4 3"]  # where an error takes it: image point and inverse depth, where it was first seen
-    lever: Float[Array, "n 4 b"]  # where the errors of the base poses take it
-    slope: Float[Array, "n 4 b"]  # of the lever, as the inverse depth changes
-    noise: Float[Array, "n 3 3"]  # covariance of the errors, in units of sigma^2
+    basis: Float[Array, "n 4 3"]
+    lever: Float[Array, "n 4 b"]
+    slope: Float[Array, "n 4 b"]
+    noise: Float[Array, "n 3 3"]
 
     @property
     def owed(self) -> Float[Array, "n 3 b"]:
-        """What a point owes to the errors of the base poses, as an error of its own."""
-        # Homogeneous: what only makes the point longer is none.
+        """What the errors of the base poses do to a point, written as an error of its own."""
+        # The point is homogeneous: a change of its length is no error, and is left out.
         return jnp.linalg.solve(jnp.concatenate([self.basis, self.point[:, :, None]], axis=2), self.lever)[:, :3]
 
 
 class BaseFramesState(eqx.Module):
-    """The current pose with its velocity, the base poses, and the points that move with these."""
+    """The current pose with its velocity, the base poses, and the points that move with these.
+
+    Attributes:
+        motion: Pose and velocity of the current frame: 12 error components.
+        bases: (k - 1,) poses of the base frames 2 to K, world to camera. Their errors are left perturbations.
+        points: The world points, in slots.
+    """
 
     motion: Kinematics | Twist
-    bases: SE3  # (k - 1,) base frames 2 to K, world to camera; errors are left perturbations
-    points: Points
+    bases: SE3
+    points: BaseFramesPoints
 
 
 class BaseFrames(eqx.Module):
-    """Model of `jaxtri.schmidt` without items: the points are part of the state. Every field is a leaf."""
+    """Model of `jaxtri.schmidt` without items: the points are part of the state. Every field is a leaf.
 
-    sigma: Float[Array, ""]  # noise of an image point, normalised image units
-    acceleration: Float[Array, ""]  # scene units per frame^2
-    angular_acceleration: Float[Array, ""]  # radians per frame^2
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length.
+        acceleration: Standard deviation of the camera's acceleration, scene units per frame^2.
+        angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2.
+    """
+
+    normalised: ClassVar[bool] = True
+    """What the model measures are normalised image points: `jaxtri.checks` warns of pixels."""
+
+    sigma: Float[Array, ""] = eqx.field(**SIGMA)
+    acceleration: Float[Array, ""] = eqx.field(converter=number)
+    angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
 
     def retract(self, mean: BaseFramesState, delta: Float[Array, " d"]) -> BaseFramesState:
-        """The state moved by an error, the points with their base frames."""
+        """The state moved by an error; the points move with their base frames."""
         bases = jax.vmap(retract)(mean.bases, delta[12:].reshape(-1, 6))
         p = mean.points
         point = p.point + p.lever @ delta[12:]
@@ -86,12 +114,12 @@ class BaseFrames(eqx.Module):
         return jnp.pad(noise(self.acceleration, self.angular_acceleration, dt), (0, mean.points.lever.shape[2]))
 
     def measured(self, mean: BaseFramesState, items: None, moved: Float[Array, "n 3"]) -> Measured:
-        """All points in the current view."""
+        """Measurements of all points in the current view, and their derivatives."""
         p, motion = mean.points, mean.motion
         pose = motion.pose
         onto = _of_pose(motion)
 
-        def one(p: Points, m: Array) -> tuple[Array, Array, Array]:
+        def one(p: BaseFramesPoints, m: Array) -> tuple[Array, Array, Array]:
             y, A, B = _derivatives(pose, p.point + p.basis @ m)
             return y, jnp.concatenate([A @ onto, B @ (p.lever + p.slope * m[2])], axis=1), B @ p.basis
 
@@ -99,7 +127,7 @@ class BaseFrames(eqx.Module):
         return Measured(y, H, B)
 
     def item_noise(self, mean: BaseFramesState, items: None) -> Float[Array, "n 3 3"]:
-        """What the base poses have no part in."""
+        """Covariance of each point's own error, in which the base poses have no part."""
         return jnp.square(self.sigma) * mean.points.noise
 
 
@@ -132,7 +160,8 @@ def start(
 ) -> ConsiderBelief[BaseFramesState]:
     """The belief at the second of `k` base frames, `frames` after the first, from a two-view estimate.
 
-    `mask` marks the pairs that it was made from. The points are those of the transfer (Yu et al. 2006, eqs 7-9).
+    `mask` marks the pairs of normalised image points that the estimate was made from, `sigma` is their noise. The
+    points are those of the transfer (Yu et al. 2006, eqs 7-9).
     """
     motion, _, of_motion, variance = from_two_view(
         two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd
@@ -148,7 +177,7 @@ def start(
 
     zero = jnp.zeros(6, dtype)
     value, by_pair = jax.vmap(jax.value_and_grad(depth), (0, None))(pairs, zero)
-    # The point goes along its first ray as its second observation moves.
+    # As the second observation moves along `onward`, the point moves along its first ray.
     seen = by_pair.at[:, :2].set(0.0)
     onward = seen / jnp.maximum(jnp.sum(seen**2, axis=1, keepdims=True), jnp.finfo(dtype).tiny)
     of_pose = jax.vmap(lambda x, dx: jax.jvp(lambda x: jax.grad(depth, 1)(x, zero), (x,), (dx,)))(pairs, onward)
@@ -157,9 +186,9 @@ def start(
     Q = M @ M.mT
     basis = jnp.eye(4, dtype=dtype)[:, jnp.array([0, 1, 3])]
     lever, slope = (jnp.zeros((n, 4, b), dtype).at[:, 3, :6].set(x) for x in of_pose)
-    points = Points(point, jnp.broadcast_to(basis, (n, 4, 3)), lever, slope, Q)
+    points = BaseFramesPoints(point, jnp.broadcast_to(basis, (n, 4, 3)), lever, slope, Q)
     bases = jax.tree.map(lambda x: jnp.broadcast_to(x, (k - 1, *x.shape)), pose)
-    # What the estimate owes to the pairs: by way of the points' errors, and the rest.
+    # What the noise of the pairs does to the estimate: a part by way of the points' own errors, and the rest.
     onto = jnp.zeros((12 + b, 6), dtype).at[:12].set(of_motion).at[12:18].set(shear(pose.translation()))
     S = jnp.einsum("de,nep->dnp", onto, sensitivity(two_view, first, second, mask, sigma))
     by_points = jnp.einsum("dnp,niq,nqp->dni", S, jnp.linalg.inv(Q), M)
@@ -171,7 +200,7 @@ def start(
 def informative(
     model: BaseFrames, belief: ConsiderBelief[BaseFramesState], smallest: Float[Array, ""] | float
 ) -> Bool[Array, " n"]:
-    """Points whose inverse depth is at least `smallest` times its standard deviation: others are not to be used.
+    """Points whose inverse depth is at least `smallest` times its standard deviation; do not use the others.
 
     A point near the epipole of its base frames says nothing, and a linear model of it is wrong.
     """
@@ -184,8 +213,8 @@ def release(
 ) -> ConsiderBelief[BaseFramesState]:
     """The belief without the base frame in `slot` (0 to K - 2), which then holds nothing.
 
-    Its error is written as a linear function of those of the other base frames; the remainder becomes an error
-    of the points, each its own.
+    The error of this base frame is written as a linear function of the errors of the other base frames. The remainder
+    becomes a part of each point's own error.
     """
     p, dtype = belief.mean.points, belief.own.dtype
     b = p.lever.shape[2]
@@ -214,7 +243,7 @@ def release(
 def forget(
     model: BaseFrames, belief: ConsiderBelief[BaseFramesState], gone: Bool[Array, " n"]
 ) -> ConsiderBelief[BaseFramesState]:
-    """The belief without the points that are `gone`; what the state owes to their errors it keeps as its own."""
+    """The belief without the points that are `gone`: what their errors did to the state becomes its own error."""
     S = jnp.where(gone[:, None], belief.sensitivity, 0.0)
     own = belief.own + schmidt.owed(S, model.item_noise(belief.mean, None))
     return ConsiderBelief(belief.mean, own, belief.sensitivity - S)
@@ -232,7 +261,7 @@ def promote(
     at = 6 * slot + jnp.arange(6)
     onto = _of_pose(mean.motion)
 
-    def one(p: Points, moved: Array, k: Array, B: Array) -> Points:
+    def one(p: BaseFramesPoints, moved: Array, k: Array, B: Array) -> BaseFramesPoints:
         def lever(further: Array) -> Array:
             m = moved.at[2].add(further)
             _, A, B = _derivatives(pose, p.point + p.basis @ m)
@@ -242,7 +271,8 @@ def promote(
         keep = jnp.eye(3, dtype=dtype) - k @ B
         zero = jnp.zeros((), dtype)
         value, slope = jax.jvp(lever, (zero,), (jnp.ones_like(zero),))
-        return Points(p.point + p.basis @ moved, p.basis, value, slope, keep @ p.noise @ keep.T + k @ k.T)
+        noise = keep @ p.noise @ keep.T + k @ k.T
+        return BaseFramesPoints(p.point + p.basis @ moved, p.basis, value, slope, noise)
 
     points = jax.vmap(one)(p, said.moved, said.gain, said.at.spread)
     bases = jax.tree.map(lambda all_, x: all_.at[slot].set(x), mean.bases, pose)
@@ -264,9 +294,9 @@ def begin(
 ) -> ConsiderBelief[BaseFramesState]:
     """The belief with new points, first seen from the base frame in `slot`, the current pose.
 
-    Their inverse depth is the given one, with the standard deviation `sd`: a narrow one, wrong for all points
-    alike, would tell on the scale. The state owes nothing to them yet; points that they replace are to be
-    forgotten first.
+    `observed` are normalised image points. All new points have the given inverse depth with the standard deviation
+    `sd`. Make `sd` wide: a narrow one that is wrong for all points alike changes the scale. The state does not depend
+    on the new points yet. `forget` the points that they replace first.
     """
     pose, p, dtype = belief.mean.motion.pose, belief.mean.points, belief.own.dtype
     R, T, eye = pose.rotation().as_matrix(), pose.translation(), jnp.eye(3, dtype=dtype)
@@ -281,7 +311,7 @@ def begin(
         return back @ jnp.append(x, inverse_depth), jnp.concatenate([inverse_depth * eye, jnp.cross(eye, x).T], axis=1)
 
     point, turned = jax.vmap(seen)(observed)
-    new = Points(
+    new = BaseFramesPoints(
         point,
         jnp.broadcast_to(back[:, jnp.array([0, 1, 3])], p.basis.shape),
         jnp.zeros_like(p.lever).at[:, :, at].set(-back[:, :3] @ turned),
@@ -305,9 +335,10 @@ def step(
     passes: int = 4,
     robust: Robust | None = None,
 ) -> tuple[ConsiderBelief[BaseFramesState], Diagnostics]:
-    """One frame, which becomes the base frame in `slot` if `base` says so; what the slot held makes room.
+    """One frame, which becomes the base frame in `slot` if `base` is True; the base frame that was there is released.
 
-    A branch, not a choice between two results: what is not taken costs nothing (but under vmap).
+    `observed` are normalised image points. A frame that becomes no base frame costs no more for it, except under vmap,
+    where both ways are computed.
     """
     predicted = schmidt.predict(model, belief, dt)
     ready = jax.lax.cond(base, lambda x: release(model, x, slot), lambda x: x, predicted)

@@ -1,11 +1,11 @@
 """The trifocal transfer with a base pair per track: every point has its own two base frames, already known.
 
 With the base poses fixed, the point that the pair fixes is constant, and the transfer to the current frame
-is the projection of that homogeneous point; what it owes to the noise of the two base observations is
-carried along as `spread`. The items are these pairs, so a frame costs O(N) with 12 error components.
+is the projection of that homogeneous point. What the noise of the two base observations does to the point is
+carried along as `spread`. The items are these points, so a frame costs O(N) with 12 error components.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,13 +14,20 @@ import numpy as np
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
+from jaxtri.checks import number
 from jaxtri.geometry.pose import difference, local, matrix, retract
 from jaxtri.geometry.trifocal import point_from_bases, project
 from jaxtri.models.motion import Twist, twist_noise
+from jaxtri.models.point_noise import SIGMA
 
 
 class BasePoint(NamedTuple):
-    """A homogeneous world point fixed by a base pair, and its derivative with respect to the two observations."""
+    """A world point fixed by a base pair.
+
+    Attributes:
+        point: (4,) homogeneous, scene units.
+        spread: (4, 4) its derivative with respect to the two observations, normalised image points.
+    """
 
     point: Float[Array, "4"]
     spread: Float[Array, "4 4"]
@@ -49,11 +56,21 @@ def base_lever(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, 
 
 
 class BasePairs(eqx.Module):
-    """Model of `jaxtri.ekf` for a camera on SE(3) whose items are `BasePoint`s; every field is a leaf."""
+    """Model of `jaxtri.ekf` for a camera on SE(3) whose items are `BasePoint`s; every field is a leaf.
 
-    sigma: Float[Array, ""]  # noise of an image point, normalised image units
-    acceleration: Float[Array, ""]  # scene units per frame^2, in camera axes
-    angular_acceleration: Float[Array, ""]  # radians per frame^2
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length. The same in all
+            three views.
+        acceleration: Standard deviation of the camera's acceleration, scene units per frame^2, in camera axes.
+        angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2.
+    """
+
+    normalised: ClassVar[bool] = True
+    """What the model measures are normalised image points: `jaxtri.checks` warns of pixels."""
+
+    sigma: Float[Array, ""] = eqx.field(**SIGMA)
+    acceleration: Float[Array, ""] = eqx.field(converter=number)
+    angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
 
     def retract(self, mean: Twist, delta: Float[Array, "12"]) -> Twist:
         """The state moved by an error."""
@@ -86,7 +103,7 @@ class BasePairs(eqx.Module):
 
     @property
     def support(self) -> np.ndarray:
-        """The pose, without the twist."""
+        """Error components that a measurement depends on: those of the pose, not of the twist."""
         return np.arange(6)
 
     def matrix(self, mean: Twist) -> Float[Array, "3 4"]:
@@ -94,11 +111,11 @@ class BasePairs(eqx.Module):
         return jnp.concatenate([matrix(mean.pose.rotation()), mean.pose.translation()[:, None]], axis=1)
 
     def coordinates(self, item: BasePoint) -> Float[Array, "4"]:
-        """The point."""
+        """The homogeneous point, which the camera matrix projects."""
         return item.point
 
     def spread(self, item: BasePoint) -> Float[Array, "4 4"]:
-        """Its derivative with respect to the two base observations."""
+        """Derivative of the homogeneous point with respect to the two base observations."""
         return item.spread
 
     def noise(self, mean: Twist, item: BasePoint) -> Float[Array, "2 2"]:

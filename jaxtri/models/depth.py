@@ -10,7 +10,7 @@ considered (Schmidt 1966: one parameter is estimated, its variance is right) or 
 default; the measurement biases of Azarbayejani & Pentland 1995, section III).
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,47 +18,79 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.checks import number
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters.linalg import linearised
 from jaxtri.filters.masks import select
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
+from jaxtri.geometry.pose import identity
+
+SMALLEST = 1e-3  # inverse depth over the median's, of the farthest depth: one near zero has no depth, or a negative one
 
 
 class Bank(NamedTuple):
-    """N points, in slots; a slot whose track has ended keeps its last estimate until another is born in it."""
+    """N points, in slots; a slot whose track has ended keeps its last estimate until another point is born in it.
 
-    parameter: Float[Array, " n"]  # inverse depth, or depth, in the camera of first sight
-    ray: Float[Array, "n 2"]  # normalised image point of first sight
-    covariance: Float[Array, "n 3 3"]  # of the errors (parameter, ray)
-    birth: SE3  # (n,) pose of the camera of first sight, world to camera
+    Attributes:
+        parameter: (n,) inverse depth, or depth, in the camera of first sight, 1 / scene units or scene units.
+        ray: (n, 2) normalised image point of first sight.
+        covariance: (n, 3, 3) of the errors (parameter, ray).
+        birth: (n,) pose of the camera of first sight, world to camera.
+    """
+
+    parameter: Float[Array, " n"]
+    ray: Float[Array, "n 2"]
+    covariance: Float[Array, "n 3 3"]
+    birth: SE3
 
 
 class WorldPoint(NamedTuple):
-    """A homogeneous world point and its covariance."""
+    """A point in the world and how well it is known.
+
+    Attributes:
+        point: (4,) homogeneous, scene units.
+        covariance: (4, 4) of the error of `point`.
+    """
 
     point: Float[Array, "4"]
     covariance: Float[Array, "4 4"]
 
 
 class Depth(eqx.Module):
-    """The filter of one point; every field but the last three is a leaf.
+    """The filter of one point; every field but the last three is a leaf. Times are in frames.
 
-    Lengths in units of the scene, image points in normalised units, time in frames.
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length.
+        ray_sigma: The same of the image point of first sight. `Depth.of` takes `sigma` for it, which is what it is. 0
+            takes the ray as exact, as in the paper: that error never averages out, and the covariance does not know it.
+        drift: Standard deviation of the parameter's change per frame, relative to the parameter (eq. 13). 0 by default:
+            the scene is static. The paper needs it, because it starts from a plane.
+        gate: Squared Mahalanobis distance of an innovation (two components) above which it is left out. Infinite by
+            default: the filter of the pose has left the outliers out already.
+        rays: Estimate the ray along with the parameter (static). Without, one number cannot explain the images better
+            than the noise of the first one allows.
+        inverse: The parameter is the inverse depth (static), in which the projection is all but linear. Off, the
+            paper's depth itself, which a wrong start may throw off for good.
+        passes: Linearisations of an update (static). Two by default: the first corrects the depth, the second
+            linearises there.
     """
 
-    sigma: Float[Array, ""]  # noise of an image point
-    ray_sigma: Float[Array, ""]  # noise of the image point of first sight; 0 takes the ray as exact
-    drift: Float[Array, ""]  # noise of the parameter per frame (eq. 13), relative to its initial value
-    gate: Float[Array, ""]  # squared Mahalanobis distance of an innovation above which it is left out
-    rays: bool = eqx.field(static=True, default=True)  # estimate the ray along with the parameter
-    inverse: bool = eqx.field(static=True, default=True)  # the parameter is the inverse depth
-    passes: int = eqx.field(static=True, default=2)  # linearisations of an update
+    normalised: ClassVar[bool] = True
+    """What the model measures are normalised image points: `jaxtri.checks` warns of pixels."""
+
+    sigma: Float[Array, ""] = eqx.field(converter=number)
+    ray_sigma: Float[Array, ""] = eqx.field(converter=number)
+    drift: Float[Array, ""] = eqx.field(converter=number)
+    gate: Float[Array, ""] = eqx.field(converter=number)
+    rays: bool = eqx.field(static=True, default=True)
+    inverse: bool = eqx.field(static=True, default=True)
+    passes: int = eqx.field(static=True, default=2)
 
     @classmethod
     def of(cls, sigma: Float[Array, ""], *, gate: Float[Array, ""] | float = jnp.inf, rays: bool = True) -> "Depth":
         """The default: inverse depth, the ray estimated (or, with `rays` False, considered), no drift."""
-        number = jnp.asarray(sigma)
-        return cls(number, number, jnp.zeros_like(number), jnp.asarray(gate, number.dtype), rays)
+        sigma = number(sigma)
+        return cls(sigma, sigma, jnp.zeros_like(sigma), jnp.asarray(gate, sigma.dtype), rays)
 
     @classmethod
     def paper(
@@ -66,13 +98,13 @@ class Depth(eqx.Module):
     ) -> "Depth":
         """As published: depth along an exact ray, one pass, process noise because the start is a plane.
 
-        With `inverse` its inverse instead, in which the projection is all but linear: a depth far from the
-        plane is thrown off by its first update and may never come back.
+        With `inverse` the parameter is the inverse depth instead, in which the projection is all but linear. As a
+        depth, a point far from the plane is thrown off by its first update and may never come back.
         """
-        number = jnp.asarray(sigma)
-        drift = jnp.asarray(drift, number.dtype)
-        gate = jnp.full((), jnp.inf, number.dtype)
-        return cls(number, jnp.zeros_like(number), drift, gate, rays=False, inverse=inverse, passes=1)
+        sigma = number(sigma)
+        drift = jnp.asarray(drift, sigma.dtype)
+        gate = jnp.full((), jnp.inf, sigma.dtype)
+        return cls(sigma, jnp.zeros_like(sigma), drift, gate, rays=False, inverse=inverse, passes=1)
 
     def plane(
         self,
@@ -83,6 +115,7 @@ class Depth(eqx.Module):
     ) -> Bank:
         """All points on a plane at depth `z_init` before the camera. Source: Yu et al. 2006, eq. 12.
 
+        `observed` are normalised image points, `pose` is that of the camera, world to camera, `z_init` in scene units.
         `relative_sd` is the standard deviation of the parameter over its value.
         """
         n, dtype = observed.shape[0], observed.dtype
@@ -121,9 +154,10 @@ class Depth(eqx.Module):
     ) -> Bank:
         """One frame: predict and update the points that are seen, given the pose. Source: eqs 16-17.
 
-        `pose_covariance` is that of its left perturbation (linear, angular), as if independent from frame to
-        frame; zero by default. What the errors of the poses have in common, a drift or the scale, is in no
-        point's covariance. Masked points stay as they are: a death keeps the last estimate.
+        `observed` are normalised image points. `pose_covariance` is that of the pose's left perturbation (linear,
+        angular), taken as independent from frame to frame; zero by default. What the errors of the poses have in
+        common, a drift or the scale, is in no point's covariance. Masked points stay as they are: a point whose track
+        has ended keeps its last estimate.
         """
         if pose_covariance is None:
             pose_covariance = jnp.zeros((6, 6), observed.dtype)
@@ -191,8 +225,8 @@ class Depth(eqx.Module):
     def world(self, bank: Bank, log_scale_variance: Float[Array, ""] | float = 0.0) -> WorldPoint:
         """The points in the world, homogeneous: shapes (n, 4) and (n, 4, 4).
 
-        `log_scale_variance` is that of the scale of the whole scene about the world's origin, which no later
-        frame can tell: see `scale_variance`.
+        `log_scale_variance` is the variance of the logarithm of the scale of the whole scene about the world's origin,
+        which no later frame can tell: see `scale_variance`.
         """
 
         def one(parameter: Array, ray: Array, C: Array, birth: SE3) -> WorldPoint:
@@ -207,14 +241,14 @@ class Depth(eqx.Module):
     def triangulated(self, two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"]) -> Bank:
         """The bank at the first of two views, the world, from their relative pose: the good start.
 
-        A point's variance is that of its triangulation, the uncertain pose included; what the errors of the
-        points have in common is left out.
+        `first` and `second` are normalised image points. A point's variance is that of its triangulation, the uncertain
+        pose included. What the errors of the points have in common is left out.
         """
         parameter, by_pose, by_noise = triangulate(two_view, first, second, inverse=self.inverse)
         spread = jnp.square(self.ray_sigma) * jnp.sum(by_noise[:, :2] ** 2, axis=1)
         spread += jnp.square(self.sigma) * jnp.sum(by_noise[:, 2:] ** 2, axis=1)
         pose = jnp.einsum("ni,ij,nj->n", by_pose, two_view.covariance, by_pose)
-        bank = self._bank(_there(first), parameter, spread + pose, SE3.identity())
+        bank = self._bank(_there(first), parameter, spread + pose, identity(first.dtype))
         cross = jnp.square(self.ray_sigma) * by_noise[:, :2]
         return bank._replace(covariance=bank.covariance.at[:, 0, 1:].set(cross).at[:, 1:, 0].set(cross))
 
@@ -224,8 +258,8 @@ def triangulate(
 ) -> tuple[Float[Array, " n"], Float[Array, "n 6"], Float[Array, "n 4"]]:
     """Inverse depths (or depths) in the first view, and their derivatives.
 
-    With respect to the errors (T, R) of the pose, and to the two observations. A depth is that of an inverse
-    depth of at least a thousandth of the median.
+    The derivatives are those with respect to the errors (T, R) of the pose, and to the two observations (normalised
+    image points). A depth is at most a thousand times that of the median inverse depth.
     """
     pairs, zero = _there(jnp.concatenate([first, second], axis=-1)), jnp.zeros(6, first.dtype)
 
@@ -234,7 +268,7 @@ def triangulate(
         R = R + jnp.cross(error[3:], R.T).T  # exp(error) R, to first order
         return inverse_depth(pair[:2], pair[2:], R, T, T)
 
-    smallest = 1e-3 * jnp.median(jax.vmap(lambda pair: at(zero, pair))(pairs))
+    smallest = SMALLEST * jnp.median(jax.vmap(lambda pair: at(zero, pair))(pairs))
 
     def parameter(error: Array, pair: Array) -> Array:
         return at(error, pair) if inverse else 1 / jnp.maximum(at(error, pair), smallest)
@@ -254,8 +288,8 @@ def scale_variance(
 ) -> Float[Array, ""]:
     """Variance of the logarithm of the scale of a scene, given the length of the base line of two views.
 
-    All that is ever known of the scale is what these two frames say: later ones refine the shape alone. So it
-    is an error common to all depths, and one that does not average out.
+    Only these two frames tell of the scale: later ones refine the shape alone. So its error is common to all depths,
+    and does not average out. `sigma` is the noise of a normalised image point.
     """
     depth, by_pose, by_noise = triangulate(two_view, first, second)
     weight = jnp.where(mask, 1 / (jnp.square(sigma) * jnp.sum(by_noise**2, axis=1)), 0.0)
@@ -268,7 +302,7 @@ def scale_variance(
 
 
 def _there(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Zero for what is NaN: masked or not, a point that is not there would make every gradient NaN."""
+    """The points, with zero for what is not finite: masked or not, a NaN would make every gradient NaN."""
     return jnp.where(jnp.isfinite(u), u, jnp.zeros((), u.dtype))
 
 

@@ -16,6 +16,7 @@ from jaxtri.geometry.pose import (
     euler_from_matrix,
     exp_pose,
     exp_rotation,
+    identity,
     matrix_from_euler,
     multiply,
     product,
@@ -23,15 +24,21 @@ from jaxtri.geometry.pose import (
     shear,
 )
 
-# Of the errors of `Kinematics`, those of the pose: translation and rotation.
+# The error components of `Kinematics` that are those of the pose: translation, then rotation.
 POSE_ROWS = np.array([0, 1, 2, 6, 7, 8])
 
 
 class Kinematics(eqx.Module):
     """Pose and velocity of a camera, translation and rotation apart: 12 error components.
 
-    In the order of the paper's state vector, T, v, R, omega (world to camera); `rotation` is an SO(3)
-    element, or the paper's (yaw, pitch, roll) with their rates. Source: Yu et al. 2006, section IV.
+    The errors are in the order of the fields, which is that of the paper's state vector (T, v, R, omega). Source: Yu et
+    al. 2006, section IV.
+
+    Attributes:
+        translation: (3,) T of the pose X_camera = R X_world + T, scene units.
+        velocity: (3,) its rate, scene units per frame.
+        rotation: R of the pose, world to camera: an SO(3) element, or the paper's angles (yaw, pitch, roll), radians.
+        angular_velocity: (3,) rate of the rotation in camera axes, or of the angles; radians per frame.
     """
 
     translation: Float[Array, "3"]
@@ -78,6 +85,10 @@ class Twist(eqx.Module):
 
     Constant velocity in the camera's own axes, so that neither a turn nor the distance from the world's
     origin disturbs the prediction.
+
+    Attributes:
+        pose: World to camera, translation in scene units. Its error is a left perturbation (linear, angular).
+        twist: (6,) velocity (linear, angular) in camera axes, scene units and radians per frame.
     """
 
     pose: SE3
@@ -89,12 +100,21 @@ class Twist(eqx.Module):
 
 
 class MotionStart(NamedTuple):
-    """Pose and velocity from a two-view estimate, with errors `lever @ e + n`: e of the estimate, n on its own."""
+    """Pose and velocity from a two-view estimate.
+
+    The errors of `motion` are `lever @ e + n`: e are the errors of the estimate, n are independent of these.
+
+    Attributes:
+        motion: Pose and velocity at the second view.
+        covariance: (6, 6) of e, in the order of `motion` (translation, rotation).
+        lever: (12, 6) what an error of the estimate does to pose and velocity.
+        variance: (12,) of n: of the velocity, zero for the pose.
+    """
 
     motion: Kinematics
-    covariance: Float[Array, "6 6"]  # of e, the pose's errors in the order of `motion` (translation, rotation)
+    covariance: Float[Array, "6 6"]
     lever: Float[Array, "12 6"]
-    variance: Float[Array, "12"]  # of n: that of the velocity
+    variance: Float[Array, "12"]
 
 
 def from_two_view(
@@ -107,8 +127,9 @@ def from_two_view(
 ) -> MotionStart:
     """The motion at the second of two views, `frames` after the first.
 
-    The velocity is that between the two, with the given standard deviations (scene units and radians per
-    frame) beside what it owes to the pose. With `euler` rotations are the paper's yaw, pitch and roll.
+    The velocity is the motion between the two views over `frames`. `velocity_sd` and `angular_velocity_sd` (scene units
+    and radians per frame) are the standard deviations of the error that it has beside that of the pose. With `euler`
+    rotations are the paper's yaw, pitch and roll.
     """
     T, R, C = two_view.translation, two_view.rotation, two_view.covariance
     dtype = T.dtype
@@ -132,7 +153,7 @@ def at_rest(
 ) -> Belief[Kinematics]:
     """The camera in the first frame, the world: its pose is exact, its velocity all but unknown."""
     zero = jnp.zeros(3, dtype)
-    rotation = jax.tree.map(lambda x: x.astype(dtype), SO3.identity())
+    rotation = identity(dtype).rotation()
     variance = _velocity(dtype, velocity_sd, angular_velocity_sd)
     return Belief(Kinematics(zero, zero, rotation, zero), jnp.diag(variance))
 

@@ -6,7 +6,7 @@ second base pose refined), and `consistent`, the default's model under `jaxtri.s
 points considered, so that every frame may refine the second base pose and nothing is counted twice.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.checks import number
 from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
 from jaxtri.filters.linalg import linearised
@@ -24,15 +25,25 @@ from jaxtri.geometry.epipolar import homogeneous, inverse_depth, perpendicular_l
 from jaxtri.geometry.pose import difference, local, retract, rotation_matrix
 from jaxtri.geometry.trifocal import transfer
 from jaxtri.models.motion import POSE_ROWS, Kinematics, MotionStart, acceleration_noise, from_two_view
+from jaxtri.models.point_noise import SIGMA
+
+SHORTEST = 1e-12  # length of a base line, scene units: what is divided by a shorter one stays finite
 
 
 class Mode(NamedTuple):
-    """What the modes of the filter differ in; pass each part where its name stands."""
+    """What the modes of the filter differ in; pass each part where its name stands.
 
-    euler: bool  # the paper's yaw, pitch and roll instead of SO(3): `start`
-    base_noise: bool  # the noise of the base points in R instead of a constant R: `Trifocal`
-    refine_base: bool  # the second base pose refined in every frame instead of considered: `Trifocal`
-    passes: int  # linearisations of an update: `ekf.filter`
+    Attributes:
+        euler: Rotations are the paper's yaw, pitch and roll instead of SO(3): an argument of `start`.
+        base_noise: The noise of the base points is in R, instead of a constant R: a field of `Trifocal`.
+        refine_base: The second base pose is refined in every frame instead of considered: a field of `Trifocal`.
+        passes: Linearisations of an update: an argument of `ekf.filter`.
+    """
+
+    euler: bool
+    base_noise: bool
+    refine_base: bool
+    passes: int
 
 
 DEFAULT = Mode(euler=False, base_noise=True, refine_base=False, passes=4)
@@ -43,6 +54,12 @@ class TrifocalState(eqx.Module):
     """Pose and velocity of the current frame and pose of the second base frame: 18 error components.
 
     The world is the camera of the first base frame. Source: Yu et al. 2006, section IV.
+
+    Attributes:
+        motion: Pose and velocity of the current frame.
+        base_translation: (3,) T of the second base frame, world to camera, scene units. Its length is the gauge.
+        base_rotation: R of the second base frame, world to camera: an SO(3) element or the paper's angles (3,), as in
+            `motion`.
     """
 
     motion: Kinematics
@@ -53,25 +70,41 @@ class TrifocalState(eqx.Module):
 class Trifocal(eqx.Module):
     """Model of `jaxtri.ekf` whose items are point pairs (u, u') of the two base frames, in one array of 4.
 
-    Every field is a leaf and may be tuned; lengths are normalised image units (pixels over focal length) and
-    units of the scene, per frame.
+    All fields but the last two are leaves and may be tuned. Lengths are in scene units, times in frames.
 
-    Every frame uses the same noise of the base points again. A second base pose that is refined as in the
-    paper takes it for new information each time, and its covariance ends ten times too small; considered, it
-    is counted with the covariance of the start and left alone.
+    Every frame uses the same noise of the base points again. A second base pose that is refined as in the paper takes
+    it for new information each time, and its covariance ends ten times too small. Where it is considered, it is counted
+    with the covariance of the start and left alone.
+
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length. The same in all
+            three views.
+        acceleration: Standard deviation of the camera's acceleration, scene units per frame^2. Higher trusts the
+            prediction less.
+        angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2. As `acceleration`.
+        base_drift: Standard deviation of the second base pose's drift per frame, in radians and base lines. 0 unless
+            the pose is refined and its covariance is to stay open to new frames.
+        epipole: (3,) epipole of the second base frame, homogeneous, as known at the start: its translation T, usually.
+        base_noise: The noise of the base points is counted in R (static). Off, R is constant, as in the paper: in a
+            prototype with several passes rotations were then more than four times less accurate.
+        refine_base: The second base pose is refined in every frame instead of considered (static). On, as in the paper,
+            rotations are 2.5 % more accurate on its experiment, and the covariance is ten times too small.
     """
 
-    sigma: Float[Array, ""]  # noise of an image point, in all three views
-    acceleration: Float[Array, ""]  # scene units per frame^2
-    angular_acceleration: Float[Array, ""]  # radians per frame^2
-    base_drift: Float[Array, ""]  # of the second base pose, per frame
-    epipole: Float[Array, "3"]  # of the second base frame, homogeneous, as known at the start
+    normalised: ClassVar[bool] = True
+    """What the model measures are normalised image points: `jaxtri.checks` warns of pixels."""
+
+    sigma: Float[Array, ""] = eqx.field(**SIGMA)
+    acceleration: Float[Array, ""] = eqx.field(converter=number)
+    angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
+    base_drift: Float[Array, ""] = eqx.field(converter=number)
+    epipole: Float[Array, "3"]
     base_noise: bool = eqx.field(static=True, default=True)
     refine_base: bool = eqx.field(static=True, default=False)
 
     @property
     def considered(self) -> Bool[np.ndarray, "18"] | None:
-        """The second base pose, unless it is refined."""
+        """Error components that are counted but not corrected: those of the second base pose, unless it is refined."""
         return None if self.refine_base else np.arange(18) >= 12
 
     def retract(self, mean: TrifocalState, delta: Float[Array, "18"]) -> TrifocalState:
@@ -127,7 +160,7 @@ class Trifocal(eqx.Module):
 
     @property
     def support(self) -> np.ndarray:
-        """The two poses, without the velocity."""
+        """Error components that a measurement depends on: those of the two poses, not of the velocity."""
         return np.concatenate([POSE_ROWS, np.arange(12, 18)])
 
     def matrix(self, mean: TrifocalState) -> Float[Array, "3 9"]:
@@ -135,14 +168,14 @@ class Trifocal(eqx.Module):
         T2, T = mean.base_translation, mean.motion.translation
         R2, R = rotation_matrix(mean.base_rotation), mean.motion.R
         tensor = T2[:, None] * R[:, None] - R2 * T[:, None, None]
-        return tensor.reshape(3, 9) / jnp.maximum(safe_norm(self.epipole), 1e-12)
+        return tensor.reshape(3, 9) / jnp.maximum(safe_norm(self.epipole), SHORTEST)
 
     def coordinates(self, item: Float[Array, "4"]) -> Float[Array, "9"]:
-        """Products of the line through the second base point and the first, homogeneous."""
+        """Products of the line through the second base point with the first base point, both homogeneous."""
         return jnp.outer(perpendicular_line(item[2:], self.epipole), homogeneous(item[:2])).ravel()
 
     def spread(self, item: Float[Array, "4"]) -> Float[Array, "9 p"]:
-        """Their derivative with respect to the two base points, with `base_noise`."""
+        """Derivative of `coordinates` with respect to the two base points; no columns without `base_noise`."""
         return jax.jacfwd(self.coordinates)(item) if self.base_noise else jnp.zeros((9, 0), item.dtype)
 
     def measured(self, mean: TrifocalState, items: Float[Array, "n 4"], moved: Float[Array, "n 4"]) -> Measured:
@@ -158,7 +191,7 @@ class Trifocal(eqx.Module):
         return Measured(y, H, J)
 
     def item_noise(self, mean: TrifocalState, items: Float[Array, "n 4"]) -> Float[Array, "n 4 4"]:
-        """That of the base points."""
+        """Covariance of the noise of each pair of base points."""
         return jnp.broadcast_to(jnp.square(self.sigma) * jnp.eye(4, dtype=items.dtype), (len(items), 4, 4))
 
 
@@ -193,9 +226,10 @@ def consistent_start(
     velocity_sd: Float[Array, ""] | float,
     angular_velocity_sd: Float[Array, ""] | float,
 ) -> schmidt.ConsiderBelief[TrifocalState]:
-    """As `start`, for `jaxtri.schmidt` with the pairs as items: the pose owes its error to their noise.
+    """As `start`, for `jaxtri.schmidt` with the pairs as items: the error of the pose comes from their noise.
 
-    `mask` marks the pairs that the two-view estimate was made from, all of its data.
+    `mask` marks the pairs that the two-view estimate was made from, all of its data. `sigma` is the noise of a
+    normalised image point.
     """
     motion = from_two_view(two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd)
     state, E, own = _with_base(motion)
@@ -204,7 +238,11 @@ def consistent_start(
 
 
 def _with_base(start: MotionStart) -> tuple[TrifocalState, Float[Array, "18 6"], Float[Array, "18 18"]]:
-    """The state at the second base frame, what its error owes to that of the estimate, and the rest's covariance."""
+    """The state at the second base frame, and where its error comes from.
+
+    Returns the state, the matrix that takes an error of the two-view estimate to one of the state, and the covariance
+    of the part of the state's error that does not come from the estimate.
+    """
     motion = start.motion
     E = jnp.concatenate([start.lever, jnp.eye(6, dtype=start.lever.dtype)])
     return TrifocalState(motion, motion.translation, motion.rotation), E, jnp.diag(jnp.pad(start.variance, (0, 6)))
@@ -216,9 +254,10 @@ def informative(
     sigma: Float[Array, ""],
     smallest_snr: Float[Array, ""] | float = 0.0,
 ) -> Bool[Array, " n"]:
-    """Pairs whose depth the base line fixes: in front of the camera, and `smallest_snr` times above its noise.
+    """Pairs in front of the camera whose inverse depth is above `smallest_snr` times its standard deviation.
 
-    A point near the epipole of the second frame has no depth, wherever it is.
+    A point near the epipole of the second frame has no depth, wherever it is. `pairs` are normalised image points with
+    the noise `sigma`.
     """
     R2, T2 = rotation_matrix(state.base_rotation), state.base_translation
 

@@ -5,13 +5,14 @@ Pentland, "Recursive estimation of motion, structure, and focal length", PAMI 19
 library; Yu et al. 2006 compare with it.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtri.checks import number
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters.model import Belief
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous
@@ -23,29 +24,53 @@ from jaxtri.models.motion import Kinematics, acceleration_noise, at_rest, from_t
 class StructureAndMotionState(eqx.Module):
     """Motion of the camera, a parameter per point, and the focal length if it is to be estimated.
 
-    12 + n errors, one more with `log_focal`, the logarithm of the true over the assumed focal length.
+    It has 12 + n error components, one more with `log_focal`.
+
+    Attributes:
+        motion: Pose and velocity of the camera.
+        parameters: (n,) inverse depth, or depth, of each point in the first camera, which is the world; 1 / scene units
+            or scene units.
+        log_focal: Logarithm of the true over the assumed focal length; None where the focal length is known.
     """
 
     motion: Kinematics
-    parameters: Float[Array, " n"]  # inverse depth, or depth, in the first camera, the world
+    parameters: Float[Array, " n"]
     log_focal: Float[Array, ""] | None = None
 
 
 class Sight(NamedTuple):
-    """An item: the image point (2,) of a point in the first frame, and its index in the state."""
+    """An item: where a point was first seen, and its place in the state.
+
+    Attributes:
+        ray: (2,) normalised image point in the first frame.
+        slot: Index of its parameter in the state.
+    """
 
     ray: Float[Array, "2"]
     slot: Int[Array, ""]
 
 
 class StructureAndMotion(eqx.Module):
-    """Model of `jaxtri.ekf` whose items are `Sight`s; every field but the last two is a leaf."""
+    """Model of `jaxtri.ekf` whose items are `Sight`s; every field but the last two is a leaf.
 
-    sigma: Float[Array, ""]  # noise of an image point, normalised image units
-    acceleration: Float[Array, ""]  # scene units per frame^2
-    angular_acceleration: Float[Array, ""]  # radians per frame^2
-    ray_noise: bool = eqx.field(static=True, default=True)  # the noise of the first image point in R
-    inverse: bool = eqx.field(static=True, default=True)  # the parameters are inverse depths
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length.
+        acceleration: Standard deviation of the camera's acceleration, scene units per frame^2.
+        angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2.
+        ray_noise: The noise of the first image point is counted in R (static). Off, that image point is taken as exact,
+            as published.
+        inverse: The parameters are inverse depths (static). Off, they are depths, with which the filter diverges in
+            nearly every trial of the paper's experiment when it starts from a plane.
+    """
+
+    normalised: ClassVar[bool] = True
+    """What the model measures are normalised image points: `jaxtri.checks` warns of pixels."""
+
+    sigma: Float[Array, ""] = eqx.field(converter=number)
+    acceleration: Float[Array, ""] = eqx.field(converter=number)
+    angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
+    ray_noise: bool = eqx.field(static=True, default=True)
+    inverse: bool = eqx.field(static=True, default=True)
 
     def retract(self, mean: StructureAndMotionState, delta: Float[Array, " d"]) -> StructureAndMotionState:
         """The state moved by an error."""
@@ -86,7 +111,7 @@ class StructureAndMotion(eqx.Module):
 
 
 def sights(first: Float[Array, "n 2"]) -> Sight:
-    """The items of a filter whose first frame, the world, saw `first`."""
+    """The items of a filter whose first frame, the world, saw the normalised image points `first`."""
     return Sight(first, jnp.arange(len(first)))
 
 
@@ -101,7 +126,7 @@ def planar_start(
     focal_sd: Float[Array, ""] | float | None = None,
     inverse: bool = True,
 ) -> Belief[StructureAndMotionState]:
-    """The belief of their day at the first frame: a plane at depth `z_init`, all errors uncorrelated, at rest.
+    """The start as published, at the first frame: a plane at depth `z_init`, errors uncorrelated, the camera at rest.
 
     The depth of the point `reference` is taken as exact, which fixes the scale. Source: Azarbayejani &
     Pentland 1995, section III; Yu et al. 2006, eq. 12.
@@ -127,11 +152,12 @@ def two_view_start(
     focal_sd: Float[Array, ""] | float | None = None,
     inverse: bool = True,
 ) -> Belief[StructureAndMotionState]:
-    """The belief at the second of two frames, from their relative pose: the joint covariance of all there is.
+    """The belief at the second of two frames, from their relative pose, with the joint covariance of the whole state.
 
-    Each point is triangulated; its error is a linear function of those of the pose and of its own two
-    observations, so the points are correlated with the pose, the velocity and each other. The length of the
-    base line is exact, which fixes the scale. The focal length enters uncorrelated.
+    `first` and `second` are normalised image points with the noise `sigma`. Each point is triangulated; its error is a
+    linear function of those of the pose and of its own two observations, so the points are correlated with the pose,
+    the velocity and each other. The length of the base line is exact, which fixes the scale. The focal length enters
+    uncorrelated.
     """
     motion, C, lever, own = from_two_view(
         two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd

@@ -1,15 +1,18 @@
 """The two-step filter: the pose given the structure, then the structure given the pose.
 
-What each half believes of the other is taken as known, so a frame costs O(N) and the correlation of pose and
+Each half takes the other half's estimate as it stands, so a frame costs O(N) and the correlation of pose and
 structure is lost. Source: Yu, Wong & Chang, "Recursive three-dimensional model reconstruction based on
 Kalman filtering", SMC-B 2005; Yu et al. 2006 compare with it.
 """
+
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.checks import number
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf
 from jaxtri.filters.scan import checkpointed
@@ -20,12 +23,23 @@ from jaxtri.models.motion import Kinematics, acceleration_noise, at_rest, from_t
 
 
 class KnownStructure(eqx.Module):
-    """Model of `jaxtri.ekf` for the pose before a scene that is known: its items are `WorldPoint`s."""
+    """Model of `jaxtri.ekf` for the pose before a scene that is known: its items are `WorldPoint`s.
 
-    sigma: Float[Array, ""]  # noise of an image point, normalised image units
-    acceleration: Float[Array, ""]  # scene units per frame^2
-    angular_acceleration: Float[Array, ""]  # radians per frame^2
-    structure_noise: bool = eqx.field(static=True, default=True)  # the points' covariance in R
+    Attributes:
+        sigma: Standard deviation of an image point in normalised image units: noise_px / focal length.
+        acceleration: Standard deviation of the camera's acceleration, scene units per frame^2.
+        angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2.
+        structure_noise: The covariance of the points is counted in R (static). Off, they are taken as exact, as
+            published.
+    """
+
+    normalised: ClassVar[bool] = True
+    """What the model measures are normalised image points: `jaxtri.checks` warns of pixels."""
+
+    sigma: Float[Array, ""] = eqx.field(converter=number)
+    acceleration: Float[Array, ""] = eqx.field(converter=number)
+    angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
+    structure_noise: bool = eqx.field(static=True, default=True)
 
     def retract(self, mean: Kinematics, delta: Float[Array, "12"]) -> Kinematics:
         """The state moved by an error."""
@@ -57,14 +71,24 @@ class KnownStructure(eqx.Module):
 
 
 class TwoStep(eqx.Module):
-    """The two filters, taken in turn."""
+    """The two filters, taken in turn.
+
+    Attributes:
+        pose: The model of the pose, given the points.
+        depth: The model of the points, given the pose.
+    """
 
     pose: KnownStructure
     depth: Depth
 
 
 class TwoStepBelief(eqx.Module):
-    """What is believed of the camera, and of the points."""
+    """What is believed of the camera, and of the points.
+
+    Attributes:
+        camera: Pose and velocity, with the covariance (12, 12) of their errors.
+        bank: The points, in slots.
+    """
 
     camera: ekf.Belief[Kinematics]
     bank: Bank
@@ -118,7 +142,7 @@ def planar_start(
     velocity_sd: Float[Array, ""] | float,
     angular_velocity_sd: Float[Array, ""] | float,
 ) -> TwoStepBelief:
-    """The belief of their day at the first frame: a plane at depth `z_init`, the camera at rest."""
+    """The start as published, at the first frame: a plane at depth `z_init`, the camera at rest."""
     camera = at_rest(first.dtype, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd)
     return TwoStepBelief(camera, model.depth.plane(first, camera.mean.pose, z_init, relative_sd))
 
