@@ -13,23 +13,41 @@ from jaxtri.errors import JaxtriError
 from jaxtri.estimation import two_view
 from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 
-HYPOTHESES = 8  # of fixed number, so that one compilation serves
+HYPOTHESES = 8  # their number is fixed, so that one compilation serves
+CONFIDENCE = 0.9999  # that a robust estimator drew a sample without outliers: a start is rare, so it may take time
+LEAST = 8  # tracks: what the 8-point algorithm needs, and fewer leave a pose with hardly anything to be judged by
+GATE = 4.0  # sigmas of Sampson distance within which a track agrees; beyond, all cost the same
+WORST = 4.0  # times the cost of the best, above which a hypothesis is not refined a second time
+AHEAD = 0.9  # share of a plane's points that must lie before the camera: the rest may be noise
+FOCAL = 1000.0  # pixels, of the made-up camera for estimators whose own thresholds are made for pixels
+SHORTEST = 1e-9  # length of a translation that counts as none
+# Radians, and length of the difference of unit translations, below which two hypotheses are the same: refined from
+# different starts, one minimum is found to about so much.
+SAME_TURN, SAME_DIRECTION = 1e-3, 2e-2
 
 
 class Hypothesis(NamedTuple):
-    """A refined relative pose, what it costs, and which tracks agree with it."""
+    """A refined relative pose, what it costs, and which tracks agree with it.
+
+    Attributes:
+        pose: The relative pose, its translation of unit length.
+        cost: Sum over the common tracks of the squared Sampson distances over sigma; 16 for a track that does not
+            agree.
+        inside: (n,) tracks within 4 sigmas and in front of both cameras.
+        parallax_deg: Median angle in degrees between the two rays of these tracks.
+    """
 
     pose: two_view.TwoView
-    cost: float  # sum of squared Sampson distances over sigma, truncated at 16
-    inside: np.ndarray  # (n,) bool: within 4 sigmas and in front of both cameras
-    parallax_deg: float  # median over those
+    cost: float
+    inside: np.ndarray
+    parallax_deg: float
 
 
 def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_point: bool = False) -> list:
     """Relative poses (R, T) from robust essential matrices; empty where OpenCV finds none.
 
-    Normalised points (n, 2), `threshold` in the same units. With `eight_point` the paper's way: the 8-point
-    algorithm inside RANSAC (Yu et al. 2006, section III).
+    `u1` and `u2` (n, 2) are normalised points, `threshold` is in the same units. With `eight_point` it is the paper's
+    way: the 8-point algorithm inside RANSAC (Yu et al. 2006, section III).
     """
     found = []
     for method in (cv2.FM_RANSAC,) if eight_point else (cv2.USAC_MAGSAC, cv2.RANSAC):
@@ -37,7 +55,7 @@ def essential_poses(u1: np.ndarray, u2: np.ndarray, threshold: float, *, eight_p
             if eight_point:
                 E = _eight_point(u1, u2, threshold)
             else:
-                E, _ = cv2.findEssentialMat(u1, u2, np.eye(3), method=method, prob=0.9999, threshold=threshold)
+                E, _ = cv2.findEssentialMat(u1, u2, np.eye(3), method=method, prob=CONFIDENCE, threshold=threshold)
         except cv2.error:  # a degenerate sample: no hypothesis
             continue
         if E is None or not np.isfinite(E).all():
@@ -58,26 +76,27 @@ def poselib_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:
         import poselib  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise JaxtriError("starts by PoseLib need it: python -m pip install 'jaxtri[init]'") from None
-    # In pixels of a focal length of 1000: PoseLib's refinement is scaled for pixels.
-    camera = {"model": "PINHOLE", "width": 2000, "height": 2000, "params": [1000.0, 1000.0, 0.0, 0.0]}
-    options = {"max_epipolar_error": 1000 * threshold}
-    pose, _ = poselib.estimate_relative_pose(1000 * u1, 1000 * u2, camera, camera, options, {})
+    # PoseLib's refinement is scaled for pixels.
+    size = int(2 * FOCAL)
+    camera = {"model": "PINHOLE", "width": size, "height": size, "params": [FOCAL, FOCAL, 0.0, 0.0]}
+    options = {"max_epipolar_error": FOCAL * threshold}
+    pose, _ = poselib.estimate_relative_pose(FOCAL * u1, FOCAL * u2, camera, camera, options, {})
     length = np.linalg.norm(pose.t)
-    found = np.isfinite(pose.R).all() and np.isfinite(length) and length > 1e-9
+    found = np.isfinite(pose.R).all() and np.isfinite(length) and length > SHORTEST
     return [(np.asarray(pose.R), np.asarray(pose.t) / length)] if found else []
 
 
 def _eight_point(u1: np.ndarray, u2: np.ndarray, threshold: float) -> np.ndarray | None:
     """Essential matrix by RANSAC over 8-point samples, then the 8-point fit to all inliers."""
-    # OpenCV's own RANSAC wants pixels; a focal length of 1000 only keeps its thresholds in a usual range.
-    F, mask = cv2.findFundamentalMat(u1 * 1000, u2 * 1000, cv2.FM_RANSAC, threshold * 1000, 0.9999)
-    if F is None or F.shape != (3, 3) or mask is None or mask.sum() < 8:
+    # OpenCV's own RANSAC expects pixels.
+    F, mask = cv2.findFundamentalMat(u1 * FOCAL, u2 * FOCAL, cv2.FM_RANSAC, threshold * FOCAL, CONFIDENCE)
+    if F is None or F.shape != (3, 3) or mask is None or mask.sum() < LEAST:
         return None
     inside = mask.ravel() == 1
-    F, _ = cv2.findFundamentalMat(u1[inside] * 1000, u2[inside] * 1000, cv2.FM_8POINT)
+    F, _ = cv2.findFundamentalMat(u1[inside] * FOCAL, u2[inside] * FOCAL, cv2.FM_8POINT)
     if F is None or F.shape != (3, 3):
         return None
-    S = np.diag([1000.0, 1000.0, 1.0])
+    S = np.diag([FOCAL, FOCAL, 1.0])
     U, _, Vt = np.linalg.svd(S @ F @ S)
     return U @ np.diag([1.0, 1.0, 0.0]) @ Vt
 
@@ -85,17 +104,17 @@ def _eight_point(u1: np.ndarray, u2: np.ndarray, threshold: float) -> np.ndarray
 def homography_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:
     """Relative poses (R, T) of a plane that fills the view; empty where there is none, or no translation."""
     try:
-        H, mask = cv2.findHomography(u1, u2, cv2.USAC_MAGSAC, threshold, maxIters=2000, confidence=0.9999)
+        H, mask = cv2.findHomography(u1, u2, cv2.USAC_MAGSAC, threshold, maxIters=2000, confidence=CONFIDENCE)
     except cv2.error:
         return []
-    if H is None or mask is None or mask.sum() < 8:
+    if H is None or mask is None or mask.sum() < LEAST:
         return []
     _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
     x1 = np.c_[u1, np.ones(len(u1))][mask.ravel() == 1]
     found = []
     for R, T, n in zip(rotations, translations, normals, strict=True):
-        ahead = np.mean(x1 @ n.ravel() > 0) > 0.9  # the plane lies in front of the first camera
-        if ahead and np.linalg.norm(T) > 1e-9:
+        ahead = np.mean(x1 @ n.ravel() > 0) > AHEAD  # the plane lies in front of the first camera
+        if ahead and np.linalg.norm(T) > SHORTEST:
             found.append((R, T.ravel() / np.linalg.norm(T)))
     return found
 
@@ -118,15 +137,15 @@ def _refine(
     common: Bool[Array, " n"],
     sigma: Float[Array, ""],
 ) -> _Refined:
-    """Every wanted hypothesis refined on its own tracks, then judged on all common ones; others cost infinity."""
+    """Every wanted hypothesis, refined on its own tracks and judged on all common ones; the unwanted cost infinity."""
 
     def one(R: Array, T: Array, mask: Array) -> _Refined:
         pose = two_view.refine(T, SO3.from_matrix(R), u1, u2, mask, sigma)
         R, T = pose.rotation.as_matrix(), pose.translation
         distance = jax.vmap(lambda a, b: sampson(essential(R, T), a, b))(u1, u2) / sigma
         inverse = jax.vmap(lambda a, b: inverse_depth(a, b, R, T, T))(u1, u2)
-        inside = common & (jnp.abs(distance) < 4) & (inverse > 0)
-        cost = jnp.sum(jnp.where(common, jnp.where(inside, distance**2, 16.0), 0.0))
+        inside = common & (jnp.abs(distance) < GATE) & (inverse > 0)
+        cost = jnp.sum(jnp.where(common, jnp.where(inside, distance**2, GATE**2), 0.0))
         angle = jax.vmap(lambda a, b: parallax(a, b, R))(u1, u2)
         return _Refined(pose, cost, inside, jnp.nanmedian(jnp.where(inside, angle, jnp.nan)))
 
@@ -154,13 +173,13 @@ def hypotheses(
 ) -> list[Hypothesis]:
     """Relative poses that may explain two views, refined, different from each other, the best first.
 
-    `u1`, `u2` (n, 2) are normalised points in slots with noise `sigma`, `mask` (n,) those seen in both;
-    `threshold` is that of the robust estimators. Essential matrices and the decomposition of a homography
-    compete, so that a plane (which has two poses) and a general scene are both served; with `eight_point`
-    only the paper's way; with `poselib` PoseLib's pose competes, too. Empty where nothing fits.
+    `u1`, `u2` (n, 2) are normalised points in slots with noise `sigma`, `mask` (n,) marks those seen in both;
+    `threshold` is that of the robust estimators, in normalised units. Essential matrices and the decomposition of a
+    homography compete, so that a plane (which has two poses) and a general scene are both served. With `eight_point`
+    there is the paper's way alone; with `poselib` PoseLib's pose competes, too. Empty where nothing fits.
     """
     a, b = u1[mask].astype(np.float64), u2[mask].astype(np.float64)
-    if len(a) < 8:
+    if len(a) < LEAST:
         return []
     poses = essential_poses(a, b, threshold, eight_point=eight_point)
     if not eight_point:
@@ -173,8 +192,8 @@ def hypotheses(
     first, second = (jnp.asarray(np.where(mask[:, None], u, 0), sigma.dtype) for u in (u1, u2))
     common = jnp.asarray(mask)
     rough = _refine(R, T, first, second, jnp.broadcast_to(common, (HYPOTHESES, len(mask))), wanted, common, sigma)
-    # Those that have come to the same end are refined once, and so is none that explains much less than the best.
-    wanted = np.isin(np.arange(HYPOTHESES), _distinct(rough, worst=4.0))
+    # Hypotheses that have become the same are refined again as one; those that explain much less than the best are not.
+    wanted = np.isin(np.arange(HYPOTHESES), _distinct(rough, worst=WORST))
     R = rough.pose.rotation.as_matrix()
     fine = _refine(R, rough.pose.translation, first, second, rough.inside, wanted, common, sigma)
     fine = jax.tree.map(np.asarray, fine)  # to take it apart there: here each index would be a program of its own
@@ -205,4 +224,4 @@ def _distinct(refined: _Refined, worst: float = np.inf) -> list[int]:
 
 def _apart(a: two_view.TwoView, b: two_view.TwoView) -> bool:
     turn = np.linalg.norm((a.rotation @ b.rotation.inverse()).log())
-    return bool(turn > 1e-3 or np.linalg.norm(a.translation - b.translation) > 2e-2)
+    return bool(turn > SAME_TURN or np.linalg.norm(a.translation - b.translation) > SAME_DIRECTION)

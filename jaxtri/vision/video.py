@@ -1,4 +1,4 @@
-"""Frames from a video file, a folder of images or a camera, with every way they can go wrong noticed."""
+"""Frames from a video file, a folder of images or a camera; whatever can go wrong on the way is noticed and said."""
 
 import contextlib
 import math
@@ -25,7 +25,13 @@ DEFAULT_FPS = 25.0
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a source: its place in the source, its time in seconds and its pixels, BGR."""
+    """One image of a source.
+
+    Attributes:
+        index: Place in the source, from 0; a frame that cannot be decoded is skipped, its number is not.
+        time_s: Seconds.
+        image: (h, w, 3) uint8, BGR.
+    """
 
     index: int
     time_s: float
@@ -47,10 +53,15 @@ class _Reader(Protocol):
 class FrameSource:
     """The frames of a video, folder or camera: a one-pass iterator of `Frame` and a context manager.
 
-    `size` is (width, height) in pixels, `declared` the number of frames that the source claims to hold (None
-    if it makes no claim), `fps` its nominal rate, `decoded` the number of frames handed out so far. Times
-    increase strictly: a time that does not is replaced by the last one plus a frame. Gray and 16-bit images
+    Times increase strictly: a time that does not is replaced by the last one plus a frame. Gray and 16-bit images
     come as 8-bit BGR. Build one with `open_source`, which documents the errors.
+
+    Attributes:
+        name: What the source is called in messages.
+        size: (width, height) in pixels.
+        declared: Frames that the source claims to hold, None where it makes no claim.
+        fps: Nominal frames a second; `DEFAULT_FPS` where neither source nor caller says.
+        decoded: Frames handed out so far.
     """
 
     def __init__(self, name: str, reader: _Reader, fps: float | None, strict: bool):
