@@ -34,3 +34,16 @@ jax.config.update("jax_enable_x64", True)
 @pytest.fixture
 def key():
     return jax.random.key(0)
+
+
+@pytest.fixture
+def compiled() -> list[float]:
+    """Seconds of every program that XLA compiles from here on; JAX has no door to stop listening by, nor need it."""
+    seconds: list[float] = []
+
+    def heard(name: str, duration: float, **_: object) -> None:
+        if name.endswith("/backend_compile_duration"):
+            seconds.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    return seconds

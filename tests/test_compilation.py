@@ -1,19 +1,18 @@
+import math
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from footage import clip
 
-from jaxtri.compilation import capacity
-from jaxtri.formats import read_camera
+from jaxtri.compilation import Stable, capacity
 from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.settings import StartSettings
 from jaxtri.vision.klt import KLT, KLTSettings
-from jaxtri.vision.video import open_source
-
-DATA = Path(__file__).parents[2] / "shared" / "data" / "indoor_7scenes_kitchen"
 
 
 @pytest.mark.parametrize(("count", "size"), [(0, 64), (1, 64), (64, 64), (65, 128), (800, 1024)])
@@ -45,26 +44,89 @@ def test_programs_are_kept_for_later_processes(tmp_path):
     assert any(theirs.iterdir())
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real sequence in {DATA}")
-def test_nothing_is_compiled_once_the_camera_is_followed():
+def made(source="def f(x): return c * x", name="f", **around):
+    """The function of that name, made anew among the variables `around`."""
+    exec(source, around)
+    return Stable(around[name])
+
+
+CALLS = "def g(x): return {} * x\ndef f(x): return g(x)"
+NESTED = "def f(x):\n    def g(y): return {} * y\n    return g(x)"
+CLOSED = "def outer(c):\n    return lambda x: c * x\nf = outer({})"
+JITTED = "import jax\n@jax.jit\ndef g(x): return {} * x\ndef f(x): return g(x)"
+DEFAULT, KEYWORD = "def f(x, c={}): return c * x", "def f(x, *, c={}): return c * x"
+
+
+@pytest.mark.parametrize("source", ["def f(x): return {} * x", CALLS, NESTED, CLOSED, JITTED, DEFAULT, KEYWORD])
+def test_a_function_made_anew_is_the_same_until_what_it_does_changes(source):
+    one, again, other = made(source.format(2)), made("\n" + source.format(2)), made(source.format(3))
+    assert (one(7), again(7), other(7)) == (14, 14, 21)
+    assert one == again
+    assert hash(one) == hash(again)
+    assert one != other
+    assert one != made(source.format(2.0))  # what it is multiplied with has another type
+
+
+@pytest.mark.parametrize(
+    ("value", "other"),
+    [
+        (2, 3),
+        (2, 2.0),
+        (0.0, -0.0),
+        ("two", "three"),
+        (np.arange(3.0), np.array([0, 1, 2 + 1e-15])),
+        (np.arange(3), np.arange(3, dtype=np.int32)),
+        (jnp.ones(2), np.ones(2)),
+        ({"a": [jnp.ones(2), 1]}, {"a": [jnp.ones(2), 2]}),
+        ({"a": 1}, {"b": 1}),
+        (np, jnp),
+        (math.sin, math.cos),
+        (os.path.join, os.path.split),
+        (int, float),
+    ],
+)
+def test_surroundings_count_by_value(value, other):
+    """Arrays and their trees by what is in them; modules, classes and functions of other modules by identity."""
+    copied = jax.tree.map(lambda x: x.copy() if isinstance(x, np.ndarray | jax.Array) else x, value)
+    assert made(c=value) == made(c=copied)
+    assert made(c=value) != made(c=other)
+    assert made("def f(x): return x", c=value) == made("def f(x): return x", c=other)  # not named, not meant
+    array = np.ones(2)
+    before = made(c=array)
+    array[0] = 2
+    assert before != made(c=array)
+
+
+def test_what_may_change_unseen_equals_itself_alone():
+    class Box:
+        value = 1
+
+    one = made(c=Box())
+    assert one == one
+    assert made(c=one.function.__globals__["c"]) != one
+    assert Stable(len) != Stable(max)
+
+
+def test_surroundings_end_where_a_library_begins():
+    """JAX's own module has a dictionary whose keys cannot be sorted: walked into, it ended in an error."""
+    source = "import jax\nfrom jax import vmap\nh = jax.vmap(abs)\ndef f(x): return vmap(h)(x)"
+    function = made(source).function
+    assert Stable(function) == Stable(function)
+
+
+def test_nothing_is_compiled_once_the_camera_is_followed(compiled):
     """Features come and go, keyframes are made; the first frames that are followed have compiled it all."""
-    compiled: list[float] = []
-
-    def listen(name, duration, **_):
-        if name.endswith("/backend_compile_duration"):
-            compiled.append(duration)
-
+    camera, images, _ = clip()
     # A number of features that no other test has compiled for.
-    klt, odometry, frames = KLT(KLTSettings(capacity=120)), Odometry(read_camera(DATA / "camera.json")), []
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    with open_source(DATA) as source:
-        for frame, _ in zip(source, range(90), strict=False):
-            tracks = klt.track(frame.image)
-            before = len(compiled)
-            klt.drop(tracks.ids[odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)])
-            frames.append((odometry.starts, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
-    segments, keyframes, programs, fresh = map(np.array, zip(*frames, strict=True))
-    followed = np.flatnonzero(segments)[2:]
+    klt = KLT(KLTSettings(capacity=120))
+    odometry, frames = Odometry(camera, start=StartSettings(lag=0), capacity=120), []
+    for frame in images:
+        tracks = klt.track(frame.image)
+        before = len(compiled)
+        klt.drop(tracks.ids[odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)])
+        frames.append((odometry.starts, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
+    starts, keyframes, programs, fresh = map(np.array, zip(*frames, strict=True))
+    followed = np.flatnonzero(starts)[2:]
     assert keyframes[-1] > 5
     assert fresh[followed].any()
     assert programs[: followed[0]].sum() > 0

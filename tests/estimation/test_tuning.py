@@ -93,6 +93,23 @@ def test_further_starts_do_no_worse_and_other_solvers_will_do():
     assert more.loss_after < one.loss_after + 1e-5
 
 
+def test_a_second_fit_with_functions_made_anew_compiles_nothing(compiled):
+    """As where a notebook's cell is run again; another number in the loss is another loss."""
+    data = walks(5, frames=77)  # a length that no other test has compiled for
+
+    def fit(factor):
+        def anew(model, data):
+            return factor * loss(model, data)
+
+        found = tuning.fit(MISTUNED, data, {"sigma": Parameter(lambda m: m.sigma)}, anew)
+        return found.loss_after, len(compiled)
+
+    (one, first), (two, second), (three, third) = fit(1.0), fit(1.0), fit(2.0)
+    assert 0 < first == second < third
+    assert one == two
+    np.testing.assert_allclose(three, 2 * one, rtol=1e-4)
+
+
 def test_losses_of_errors():
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (6, 3)) + np.array([0, 0, 4])
