@@ -35,13 +35,14 @@ class Stable:
 
     Whoever runs a notebook's cell again makes each of its functions anew; as a key of a compiled program the old and
     the new one are the same, unless something they refer to has changed. Surroundings are the variables that the code
-    names: functions by theirs, arrays, numbers and trees of these by value, modules and classes by identity. What
-    may change unseen, as an object of another kind, makes a function equal to itself alone.
+    names: functions of the same module by theirs, jitted or not; arrays, numbers and trees of these by value; modules,
+    classes and functions of other modules by identity. What may change unseen, as an object of another kind, makes a
+    function equal to itself alone.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
-        self._key = _function_key(function, ())
+        self._key = _function_key(function, (), getattr(function, "__globals__", None))
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The function's value."""
@@ -67,14 +68,17 @@ class _Same:
         return id(self.thing)
 
 
-def _function_key(function: Any, outer: tuple[Any, ...]) -> Hashable:
-    if not isinstance(function, FunctionType) or function in outer:
+def _function_key(function: Any, outer: tuple[Any, ...], home: dict[str, Any] | None) -> Hashable:
+    if isinstance(function, jax.stages.Wrapped):  # by `jax.jit`, whose options do not change a value
+        function = getattr(function, "__wrapped__", function)
+    # What another module holds is not walked through: a library has no end, and is not made anew with a cell.
+    if not isinstance(function, FunctionType) or function in outer or function.__globals__ is not home:
         return _Same(function)
     inner = (*outer, function)
     named = {n: function.__globals__[n] for n in sorted(_names(function.__code__)) if n in function.__globals__}
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     around = [*named.values(), *cells, function.__defaults__, function.__kwdefaults__]
-    return _code_key(function.__code__), tuple(named), tuple(_value_key(x, inner) for x in around)
+    return _code_key(function.__code__), tuple(named), tuple(_value_key(x, inner, home) for x in around)
 
 
 def _names(code: CodeType) -> set[str]:
@@ -87,21 +91,21 @@ def _code_key(code: CodeType) -> Hashable:
     return code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars, code.co_argcount
 
 
-def _value_key(value: Any, outer: tuple[Any, ...]) -> Hashable:
+def _value_key(value: Any, outer: tuple[Any, ...], home: dict[str, Any] | None) -> Hashable:
     leaves, tree = jax.tree.flatten(value)
     if len(leaves) == 1 and leaves[0] is value:
-        return _leaf_key(value, outer)
-    return tree, tuple(_leaf_key(leaf, outer) for leaf in leaves)
+        return _leaf_key(value, outer, home)
+    return tree, tuple(_leaf_key(leaf, outer, home) for leaf in leaves)
 
 
-def _leaf_key(leaf: Any, outer: tuple[Any, ...]) -> Hashable:
+def _leaf_key(leaf: Any, outer: tuple[Any, ...], home: dict[str, Any] | None) -> Hashable:
     if isinstance(leaf, bool | int | float | complex | str | bytes):
         return type(leaf), repr(leaf)
     if isinstance(leaf, np.ndarray | np.generic) or (isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer)):
         value = np.asarray(leaf)
         return type(leaf), value.dtype, value.shape, hashlib.sha256(value.tobytes()).digest()
-    if isinstance(leaf, FunctionType):
-        return _function_key(leaf, outer)
+    if isinstance(leaf, FunctionType | jax.stages.Wrapped):
+        return _function_key(leaf, outer, home)
     if isinstance(leaf, ModuleType | type | BuiltinFunctionType):
         return _Same(leaf)
     return _Same(object())
