@@ -10,24 +10,34 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int
 
+from jaxtri.checks import number
 from jaxtri.errors import TrajectoryError
+
+# Largest departure of R R' from the identity: wide, since files carry few digits; it is for matrices of another kind.
+RIGID = 1e-3
+MATCHES = 3  # frames that two trajectories must have in common: two points leave a rotation open
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Camera poses over time, on the host.
 
-    `times` are in seconds, strictly increasing; `T_world_camera` in units of the scene. `covariance` is that
-    of the error of each pose: of the camera centre in world axes and scene units first, then of the rotation
-    vector dtheta in camera axes and radians, with R_estimate = R_true exp(dtheta). `status` is for the
-    producer's codes. Raises `TrajectoryError` naming the first entry that cannot be used.
+    Raises `TrajectoryError` naming the first entry that cannot be used.
+
+    Attributes:
+        times: (t,) float64, seconds, strictly increasing.
+        T_world_camera: (t, 4, 4) float64, camera to world, translation in scene units.
+        covariance: (t, 6, 6) float64 of the error of each pose, or None: of the camera centre in world axes and scene
+            units first, then of the rotation vector dtheta in camera axes and radians, with R_estimate = R_true
+            exp(dtheta).
+        status: (t,) int, codes of whoever made the trajectory, or None; `jaxtri.Status` for those of a run.
     """
 
-    # Shapes are checked below, with a message of our own.
-    times: np.ndarray  # (t,) float64
-    T_world_camera: np.ndarray  # (t, 4, 4) float64
-    covariance: np.ndarray | None = None  # (t, 6, 6) float64
-    status: np.ndarray | None = None  # (t,) int
+    # The shapes are checked below, with a message of our own.
+    times: np.ndarray
+    T_world_camera: np.ndarray
+    covariance: np.ndarray | None = None
+    status: np.ndarray | None = None
 
     def __post_init__(self):
         shapes = {"times": (), "T_world_camera": (4, 4), "covariance": (6, 6), "status": ()}
@@ -52,8 +62,7 @@ class Trajectory:
                 f"times[{i}] = {self.times[i]} does not come after times[{i - 1}] = {self.times[i - 1]}"
             )
         R = self.rotations
-        # Files carry few digits; the check is for matrices of another kind or axes of the other hand.
-        rigid = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max((1, 2)) < 1e-3
+        rigid = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max((1, 2)) < RIGID
         rigid &= (np.linalg.det(R) > 0) & (np.abs(self.T_world_camera[:, 3] - [0, 0, 0, 1]).max(-1) < 1e-9)
         if not rigid.all():
             raise TrajectoryError(f"T_world_camera[{np.argmin(rigid)}] is no rigid motion [R p; 0 0 0 1]")
@@ -78,9 +87,15 @@ class Trajectory:
 
 
 class Similarity(eqx.Module):
-    """A similarity transform x -> scale rotation x + translation."""
+    """A similarity transform x -> scale rotation x + translation.
 
-    scale: Float[Array, ""]
+    Attributes:
+        scale: Units of the target in one unit of the source.
+        rotation: (3, 3) matrix.
+        translation: (3,) in units of the target.
+    """
+
+    scale: Float[Array, ""] = eqx.field(converter=number)
     rotation: Float[Array, "3 3"]
     translation: Float[Array, "3"]
 
@@ -103,8 +118,8 @@ def align(
 ) -> Similarity:
     """The similarity (or rigid motion) that takes `source` closest to `target` in least squares.
 
-    Rotations that the points leave open (all on a line, or all the same) are chosen arbitrarily, and
-    nothing is differentiated along them; the scale of a static source is 1. Umeyama 1991, eqs. 40-42.
+    A rotation that the points leave open (all on a line, or all the same) is chosen arbitrarily, and
+    nothing is differentiated along it; the scale of a static source is 1. Umeyama 1991, eqs. 40-42.
     """
     weights = _weights(source, mask)
     source, target = _kept(source, mask), _kept(target, mask)
@@ -115,7 +130,7 @@ def align(
     scale = jnp.ones((), source.dtype)
     if with_scale:
         variance = weights @ (a * a).sum(-1)
-        # Less than the rounding of the coordinates is a camera that stands still.
+        # A camera whose variance is below the rounding of its coordinates stands still.
         static = variance <= (8 * jnp.finfo(source.dtype).eps * jnp.abs(source).max()) ** 2
         scale = jnp.where(static, 1, (R * covariance).sum() / jnp.where(static, 1, variance))
     return Similarity(scale, R, mean_target - scale * R @ mean_source)
@@ -173,7 +188,7 @@ def rotation_errors(
 ) -> Float[Array, " t"]:
     """Angle (radians) between the orientations of each frame, after turning the estimate's world.
 
-    By `rotation` (say, that of `align`); without it by the constant rotation that is best for the
+    The world is turned by `rotation` (say, that of `align`); by default by the constant rotation that is best for the
     orientations themselves in the chordal sense. Hartley et al. 2013, section 5.3.
     """
     if rotation is None:
@@ -195,18 +210,31 @@ def nees(errors: Float[Array, "*batch d"], covariance: Float[Array, "*batch d d"
 class Evaluation:
     """How far an estimate is from a reference, after one alignment of the whole; see `evaluate`.
 
-    Lengths are in units of the reference, percentages of a zero length are inf (or 0 for a zero error).
+    Lengths are in units of the reference. A percentage of a zero length is inf, or 0 for a zero error.
+
+    Attributes:
+        matched: Frames of the estimate that have a frame of the reference.
+        coverage: Share of the reference's frames that are matched.
+        scale: Reference units in one unit of the estimate.
+        ate_rmse: Root mean square of the distances between the camera centres.
+        ate_percent: The same, in per cent of the reference's path through the matched frames.
+        rpe_translation: Root mean square error of the motion from each matched frame to the next, the estimate scaled
+            as a whole.
+        rpe_translation_percent: The same, in per cent of the reference's mean step.
+        rpe_rotation_deg: Root mean square error of the rotation from each matched frame to the next, degrees.
+        rotation_rmse_deg: Root mean square error of the orientations, after the best constant rotation of the world,
+            degrees.
     """
 
-    matched: int  # frames of the estimate with a frame of the reference
-    coverage: float  # share of the reference's frames that are matched
-    scale: float  # reference units in one unit of the estimate
+    matched: int
+    coverage: float
+    scale: float
     ate_rmse: float
-    ate_percent: float  # of the reference's path through the matched frames
-    rpe_translation: float  # RMSE over successive matched frames, the estimate scaled as a whole
-    rpe_translation_percent: float  # of the reference's mean step
-    rpe_rotation_deg: float  # RMSE over successive matched frames
-    rotation_rmse_deg: float  # RMSE of orientations, after the best constant rotation of the world
+    ate_percent: float
+    rpe_translation: float
+    rpe_translation_percent: float
+    rpe_rotation_deg: float
+    rotation_rmse_deg: float
 
 
 def evaluate(
@@ -219,13 +247,13 @@ def evaluate(
     """Compare two trajectories frame by frame, in JAX's default float.
 
     Frames are matched when each is the other's nearest in time, within `max_time_difference` seconds.
-    Raises `TrajectoryError` for fewer than three matches. Sturm et al. 2012, section V.
+    Raises `TrajectoryError` where fewer than three match. Sturm et al. 2012, section V.
     """
     i, j = associate(estimate.times, reference.times, max_time_difference)
-    if len(i) < 3:
+    if len(i) < MATCHES:
         spans = [f"{x.times[0]:.9g} to {x.times[-1]:.9g} s ({len(x)} frames)" for x in (estimate, reference)]
         raise TrajectoryError(
-            f"only {len(i)} frames match within {max_time_difference} s and 3 are needed: the estimate spans "
+            f"only {len(i)} frames match within {max_time_difference} s and {MATCHES} are needed: the estimate spans "
             f"{spans[0]}, the reference {spans[1]}; check the clocks and units, or max_time_difference"
         )
     poses = _centred(estimate.T_world_camera[i]), _centred(reference.T_world_camera[j])
@@ -250,7 +278,7 @@ def associate(
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Indices of the pairs of times that are each other's nearest, at most `max_difference` apart.
 
-    Both lists must increase; on the host.
+    Both lists must increase. Host only.
     """
 
     def nearest(times, others):

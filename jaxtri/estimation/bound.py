@@ -16,6 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtri.estimation.two_view import tangent_basis
 from jaxtri.geometry.epipolar import dehomogenise, safe_norm
 
+_RIDGE = 1e-13  # over variances scaled to 1: a point that is not fixed in some direction stays invertible
+
 
 class _Normal(NamedTuple):
     """Blocks of the Fisher information, in units of 1 / sigma^2; t frames without the first."""
@@ -38,10 +40,10 @@ def filtering_bound(
 ) -> Float[Array, "k 6 6"]:
     """Smallest covariance of the pose of a frame that any unbiased filter can reach from frames up to it.
 
-    `points` in the world, poses world to camera, the first the identity; `sigma` of a normalised image point;
-    `mask` False where a point is not seen. Errors (T, R): a sum in T, `exp(delta) R` in R. `frames` are the
-    ones asked for, all but the first two by default (the first is the gauge; k is their number). A frame
-    costs O(n t^2 + t^3).
+    `points` are in the world, poses world to camera, the first of them the identity. `sigma` is the noise of a
+    normalised image point: noise_px / focal length. `mask` is False where a point is not seen. Errors are (T, R): a sum
+    in T, `exp(delta) R` in R. `frames` are the k frames asked for, by default all but the first two (the first is the
+    gauge). A frame costs O(n t^2 + t^3).
     """
     normal = _normal(points, rotations, translations, mask)
     count = len(rotations) - 1
@@ -64,7 +66,10 @@ def smoothing_bound(
     sigma: Float[Array, ""] | float,
     mask: Bool[Array, "t n"] | None = None,
 ) -> Float[Array, "t-1 6 6"]:
-    """Smallest covariance of every pose but the first, the gauge, from all frames. As `filtering_bound`."""
+    """Smallest covariance of every pose from all frames; of all but the first, which is the gauge.
+
+    Arguments as of `filtering_bound`.
+    """
     normal = _normal(points, rotations, translations, mask)
     count = len(rotations) - 1
     S = _reduced(normal, normal.first + jnp.sum(normal.points, axis=0), jnp.ones(count, bool))
@@ -98,9 +103,9 @@ def _normal(
 def _reduced(normal: _Normal, V: Float[Array, "n 3 3"], used: Bool[Array, " t"]) -> Float[Array, "s s"]:
     """Information on the poses, s = 6t, with the points eliminated; unused frames are exact."""
     t = len(used)
-    # A point that no frame has fixed yet says nothing.
+    # A point that no frame has seen yet has no variance: it is scaled by 1, and says nothing.
     s = jnp.sqrt(jnp.where(jnp.diagonal(V, axis1=1, axis2=2) > 0, jnp.diagonal(V, axis1=1, axis2=2), 1.0))
-    L = jnp.linalg.cholesky(V / (s[:, :, None] * s[:, None, :]) + 1e-13 * jnp.eye(3, dtype=V.dtype))
+    L = jnp.linalg.cholesky(V / (s[:, :, None] * s[:, None, :]) + _RIDGE * jnp.eye(3, dtype=V.dtype))
     W = jnp.where(used[:, None, None, None], normal.mixed, 0.0) / s[:, None, :]
     Y = jax.vmap(lambda L, w: jax.scipy.linalg.solve_triangular(L, w.T, lower=True))(
         L, jnp.moveaxis(W, 1, 0).reshape(len(V), 6 * t, 3)
@@ -114,7 +119,7 @@ def _reduced(normal: _Normal, V: Float[Array, "n 3 3"], used: Bool[Array, " t"])
 
 
 def _second(normal: _Normal, block: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """The second frame's covariance in its own errors; it has none along the base line."""
+    """The second frame's covariance in the errors (T, R), with none along the base line, whose length is exact."""
     block = block.at[0].set(0.0).at[:, 0].set(0.0)
     return normal.basis @ block @ normal.basis.T
 

@@ -27,17 +27,25 @@ from jaxtri.filters.masks import stand_in
 from jaxtri.geometry.trifocal import project
 from jaxtri.trajectory import nees
 
+DIRECTIONS = 16  # most directions along which the slope at a start is taken: each costs a run of the filter
+STEP = 1e-4  # of these differences: a ten-thousandth of a noise, where its logarithm is fitted
+
 M = TypeVar("M")
 D = TypeVar("D")
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A leaf to fit, scalar or array: `where` picks it from the model.
+    """A leaf to fit, scalar or array.
 
-    With `log` the fit runs over log(value - floor): for what is positive. A noise that the data do not bound
-    from below runs to zero: give it a `floor`, or a prior. `prior_sd` is the standard deviation of a Gaussian
-    prior about the value at the start, of the logarithm with `log`; it weighs as one observation of the loss.
+    Attributes:
+        where: Picks the leaf from the model.
+        log: Fit log(value - floor), for what is positive, instead of the value. On, since noises are what is fitted
+            mostly.
+        floor: Smallest value, with `log`. A noise that the data do not bound from below runs to zero: give it a floor
+            above zero, or a prior.
+        prior_sd: Standard deviation of a Gaussian prior about the value at the start, of the logarithm with `log`; it
+            weighs as one observation of the loss. None for no prior.
     """
 
     where: Callable[[Any], Array]
@@ -46,7 +54,7 @@ class Parameter:
     prior_sd: float | None = None
 
     def free(self, value: Array) -> Array:
-        """The number that is fitted."""
+        """The number that is fitted, from the leaf."""
         return jnp.log(value - self.floor) if self.log else value
 
     def value(self, free: Array) -> Array:
@@ -56,7 +64,16 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Fit(Generic[M]):
-    """What a fit found: the model, the losses before and after, and each parameter's values before and after."""
+    """What a fit found.
+
+    Attributes:
+        model: The fitted model.
+        converged: Whether the best start ended at a minimum, with a finite loss.
+        loss_before: Loss of the model that was given.
+        loss_after: Loss of the fitted model.
+        steps: Steps of the solver, all starts together.
+        changes: Value of each parameter before and after, by its name.
+    """
 
     model: M
     converged: bool
@@ -187,13 +204,12 @@ def _evaluate(objective: _Objective, free: Mapping[str, Array], data: Any) -> Fl
 
 
 def _slope(value: Callable[[dict[str, Array]], float], at: dict[str, Array], there: float) -> float:
-    """Length of the gradient, by differences along at most 16 directions: a gradient would be compiled once more."""
+    """Length of the gradient, by differences along a few directions: a gradient would be compiled once more."""
     flat, unravel = ravel_pytree(at)
     directions = np.eye(flat.size)
-    if flat.size > 16:
-        directions = np.linalg.qr(np.random.default_rng(0).standard_normal((flat.size, 16)))[0].T
-    h = 1e-4
-    slopes = [(value(unravel(flat + h * jnp.asarray(d, flat.dtype))) - there) / h for d in directions]
+    if flat.size > DIRECTIONS:
+        directions = np.linalg.qr(np.random.default_rng(0).standard_normal((flat.size, DIRECTIONS)))[0].T
+    slopes = [(value(unravel(flat + STEP * jnp.asarray(d, flat.dtype))) - there) / STEP for d in directions]
     length = float(np.linalg.norm(slopes)) * math.sqrt(flat.size / len(directions))
     return length if math.isfinite(length) and length > 0 else 1.0
 
@@ -224,12 +240,12 @@ def _show(number: Array, value: Array) -> None:
 def negative_log_likelihood(
     diagnostics: Diagnostics, components: int = 2, outlier: Float[Array, ""] | float = 0.0
 ) -> Float[Array, ""]:
-    """Of the innovations of a whole run, per component of a measurement; infinite where an update was refused.
+    """Negative log-likelihood of all innovations of a run, per component of a measurement.
 
-    Of iterated and robust updates it is Laplace's approximation: see `Diagnostics`. What a robust gate leaves out
-    counts with the logarithm of a density of its own, `outlier`, lest a fit gain by leaving out what it explains
-    badly; zero is one outlier evenly over an image of one normalised unit by one. Of a run over recorded video take
-    `jaxtri.replay.negative_log_likelihood`.
+    Infinite where an update was refused. For iterated and robust updates it is Laplace's approximation: see
+    `Diagnostics`. Each point that the robust gate leaves out counts with `outlier`, the logarithm of a density, lest a
+    fit gain by leaving out what it explains badly; zero is one outlier evenly over an image of one normalised unit by
+    one. For a run over recorded video use `jaxtri.replay.negative_log_likelihood`.
     """
     count = jnp.maximum(jnp.sum(diagnostics.measured), 1)
     outside = jnp.sum(diagnostics.measured - diagnostics.used) * outlier

@@ -12,12 +12,19 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtri.geometry.epipolar import essential, safe_norm, sampson
 
+AGREEING = 3.0  # sigmas of Sampson distance within which a pair counts in `rms`: others are taken for outliers
+FEWEST = 5  # pairs for the five unknowns of a relative pose, unless a prior holds what the pairs leave open
+
 
 class TwoView(eqx.Module):
     """Relative pose X2 = R X1 + T of two views, and how well it is known.
 
-    `covariance` is that of the errors (T, R): a sum in T, `exp(delta) R` in R. It has no part along T, whose
-    length is the gauge. `rms` is the root mean square of the Sampson distances, in units of sigma.
+    Attributes:
+        translation: (3,) T. Its length is the gauge, in whatever unit it was given.
+        rotation: R.
+        covariance: (6, 6) of the errors (T, R): a sum in T, `exp(delta) R` in R. It has no part along T.
+        rms: Root mean square of the Sampson distances of the pairs that agree, over sigma: 1 is right.
+        converged: Whether the estimate can be used: the refinement ended, at finite numbers, with enough pairs.
     """
 
     translation: Float[Array, "3"]
@@ -82,9 +89,9 @@ def refine(
 ) -> TwoView:
     """Pose that minimises the robust Sampson distances of the pairs, with |T| as given.
 
-    `u1`, `u2` are normalised points with noise `sigma`; masked pairs count nothing. `prior` is the covariance
-    of the given pose, errors (T, R), where the estimate is to be combined with what was known (its part along
-    T counts nothing). Distances beyond `huber` sigmas count linearly. The Sampson distance is, to first
+    `u1`, `u2` are normalised points with the noise `sigma` (noise_px / focal length); masked pairs count nothing.
+    `prior` is the covariance of the given pose, errors (T, R), where the estimate is to be combined with what was known
+    (its part along T counts nothing). Distances beyond `huber` sigmas count linearly. The Sampson distance is, to first
     order, the residual left when every point's structure is eliminated (Hartley & Zisserman 2004, 11.4.3).
     """
     dtype = translation.dtype
@@ -137,12 +144,11 @@ def refine(
     J_R = jax.jacfwd(lambda y: (pose(y)[1] @ R.inverse()).log())(x)
     lift = jnp.concatenate([onto @ (onto.T @ J_T), J_R])
     d = distances(x)
-    inlier = jnp.abs(d) < 3
+    inlier = jnp.abs(d) < AGREEING
     rms = jnp.sqrt(jnp.sum(jnp.where(inlier, d**2, 0)) / jnp.maximum(jnp.sum(valid * inlier), 1))
     covariance = lift @ ((inside + inside.T) / 2) @ lift.T
     known = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(inside) > 0)
-    # Five unknowns want five pairs, unless a prior holds what the pairs leave open.
-    enough = (jnp.sum(mask) >= 5) | (prior is not None)
+    enough = (jnp.sum(mask) >= FEWEST) | (prior is not None)
     ok = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(x)) & known & enough
     return TwoView(T, R, covariance, rms, ok)
 
@@ -154,9 +160,10 @@ def sensitivity(
     mask: Bool[Array, " n"],
     sigma: Float[Array, ""] | float,
 ) -> Float[Array, "n 6 4"]:
-    """What the error of an estimate owes to those of its pairs: derivative of (T, R) with respect to (u1, u2).
+    """What errors of the pairs do to an estimate: derivative of the error (T, R) with respect to those of (u1, u2).
 
-    Errors are truth minus estimate, or observation. `mask` and `sigma` are those of `refine`; zero where masked.
+    An error is truth minus estimate, or truth minus observation. `mask` and `sigma` are those of `refine`. Masked pairs
+    have zero.
     """
     T, R = two_view.translation, two_view.rotation.as_matrix()
 

@@ -10,18 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtri.checks import concrete
+from jaxtri.checks import concrete, number
 from jaxtri.errors import CameraError
 
 # Newton doubles the radius at most, from 1: enough steps for 89.9 degrees off the axis of a fisheye lens,
 # and for a dozen rejected steps near the fold of a strong barrel distortion.
 _STEPS = 30
+# Largest coordinate that is distorted, 89.4 degrees off the axis: without a limit the sixth powers overflow, and
+# inf * 0 is NaN even for coefficients of zero.
+_WIDEST = 100
+_FARTHEST = 1e6  # largest coordinate that a fisheye lens distorts: the square of more overflows in float32
+_NEAR = 1e-5  # squared radius up to which three terms of the series of arctan are exact to rounding
 
 
 class BrownConrady(eqx.Module):
     """Radial (rational) and tangential distortion, `cv2.projectPoints`'s model without prism and tilt.
 
-    Coefficients in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6; Brown 1966, OpenCV's calib3d documentation.
+    Source: Brown 1966, OpenCV's calib3d documentation.
+
+    Attributes:
+        coefficients: (8,) without unit, in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6.
     """
 
     coefficients: Float[Array, "8"]
@@ -39,8 +47,7 @@ class BrownConrady(eqx.Module):
     def distort(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Distort one normalised point. Coordinates beyond 100 (89.4 degrees) count as 100."""
         k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
-        # Without the limit the sixth powers overflow, and inf * 0 is NaN even for coefficients of zero.
-        x, y = jnp.clip(xy, -100, 100)
+        x, y = jnp.clip(xy, -_WIDEST, _WIDEST)
         r2 = x * x + y * y
         denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
         tiny = math.sqrt(jnp.finfo(xy.dtype).eps)
@@ -57,7 +64,9 @@ class BrownConrady(eqx.Module):
 class Fisheye(eqx.Module):
     """Kannala-Brandt distortion, `cv2.fisheye`'s model: a polynomial of the angle to the optical axis.
 
-    Coefficients k1 k2 k3 k4. All zero is the equidistant projection, which is still not a pinhole.
+    Attributes:
+        coefficients: (4,) without unit: k1 k2 k3 k4. All zero is the equidistant projection, which is still not a
+            pinhole.
     """
 
     coefficients: Float[Array, "4"]
@@ -70,9 +79,9 @@ class Fisheye(eqx.Module):
     def distort(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Distort one normalised point. Coordinates beyond 1e6 count as 1e6."""
         k1, k2, k3, k4 = self.coefficients
-        xy = jnp.clip(xy, -1e6, 1e6)  # the square of more overflows in float32
+        xy = jnp.clip(xy, -_FARTHEST, _FARTHEST)
         r2 = xy @ xy
-        near = r2 < 1e-5  # where three terms of the series are exact to rounding
+        near = r2 < _NEAR
         r = jnp.sqrt(jnp.where(near, 1, r2))
         ratio = jnp.where(near, 1 - r2 / 3 + r2 * r2 / 5, jnp.arctan(r) / r)  # theta / r
         theta2 = r2 * ratio * ratio
@@ -91,7 +100,7 @@ def undistort(distortion: BrownConrady | Fisheye, xy: Float[Array, "2"]) -> Floa
     # The loop is not differentiated: one Newton step from its result has the derivatives, whatever path
     # led there, and reverse mode keeps nothing of the path.
     frozen = jax.tree.map(jax.lax.stop_gradient, distortion)
-    target = jnp.clip(jax.lax.stop_gradient(xy), -1e6, 1e6)
+    target = jnp.clip(jax.lax.stop_gradient(xy), -_FARTHEST, _FARTHEST)
     identity = jnp.eye(2, dtype=xy.dtype)
 
     def residual(z):
@@ -124,15 +133,25 @@ def undistort(distortion: BrownConrady | Fisheye, xy: Float[Array, "2"]) -> Floa
 class Camera(eqx.Module):
     """A pinhole camera with an optional lens distortion; every intrinsic may be differentiated.
 
-    Focal lengths, centre and skew are in pixels: u = fx x + skew y + cx, v = fy y + cy.
-    `width` and `height` are those of the image, None if unknown.
+    u = fx x + skew y + cx, v = fy y + cy, for a normalised (and then distorted) point (x, y). The centre of the
+    top-left pixel is (0, 0). Every field but the last two is a leaf.
+
+    Attributes:
+        fx: Focal length along the rows of the image, pixels.
+        fy: Focal length along its columns, pixels.
+        cx: Column of the principal point, pixels.
+        cy: Row of the principal point, pixels.
+        skew: Skew of the axes, pixels; zero for nearly every camera.
+        distortion: Distortion of the lens, None for a pinhole.
+        width: Width of the image in pixels, None where it is not known (static).
+        height: Height of the image in pixels, None where it is not known (static).
     """
 
-    fx: Float[Array, ""]
-    fy: Float[Array, ""]
-    cx: Float[Array, ""]
-    cy: Float[Array, ""]
-    skew: Float[Array, ""]
+    fx: Float[Array, ""] = eqx.field(converter=number)
+    fy: Float[Array, ""] = eqx.field(converter=number)
+    cx: Float[Array, ""] = eqx.field(converter=number)
+    cy: Float[Array, ""] = eqx.field(converter=number)
+    skew: Float[Array, ""] = eqx.field(converter=number)
     distortion: BrownConrady | Fisheye | None = None
     width: int | None = eqx.field(static=True, default=None)
     height: int | None = eqx.field(static=True, default=None)
