@@ -224,6 +224,10 @@ def _judge(arguments: Mapping[str, Any]) -> None:
             raise InputError(f"{name} is {value}; give at least 1")
         if name == "dt" and (steps := concrete(value)) is not None and not np.isfinite(steps).all():
             raise InputError("dt is not finite: give the time since the frame before, one for all or one a frame")
+        if name in ("covariance", "prior") and isinstance(value, jax.Array):
+            covariance(name, value)
+        if name == "sigma":
+            positive(name, value)
         for field in ("covariance", "own"):
             part = getattr(value, field, None)
             if isinstance(part, jax.Array):

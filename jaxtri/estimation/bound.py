@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.checks import checked
 from jaxtri.estimation.two_view import tangent_basis
 from jaxtri.geometry.epipolar import dehomogenise, safe_norm
 
@@ -29,6 +30,7 @@ class _Normal(NamedTuple):
     basis: Float[Array, "6 6"]  # of the second frame's errors, its first column along the base line
 
 
+@checked
 def filtering_bound(
     points: Float[Array, "n 3"],
     rotations: Float[Array, "t 3 3"],
@@ -59,6 +61,7 @@ def filtering_bound(
     return jnp.square(sigma) * jax.lax.map(at, jnp.arange(2, count + 1) if frames is None else frames)
 
 
+@checked
 def smoothing_bound(
     points: Float[Array, "n 3"],
     rotations: Float[Array, "t 3 3"],

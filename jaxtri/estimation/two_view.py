@@ -10,6 +10,7 @@ import optimistix as optx
 from jaxlie import SO3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.checks import checked
 from jaxtri.geometry.epipolar import essential, safe_norm, sampson
 
 AGREEING = 3.0  # sigmas of Sampson distance within which a pair counts in `rms`: others are taken for outliers
@@ -75,6 +76,7 @@ def tangent_basis(n: Float[Array, "3"]) -> Float[Array, "3 2"]:
     )
 
 
+@checked
 def refine(
     translation: Float[Array, "3"],
     rotation: SO3,

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri.checks import number
+from jaxtri.checks import checked, number
 from jaxtri.estimation.two_view import TwoView, sensitivity
 from jaxtri.filters import schmidt
 from jaxtri.filters.diagnostics import Diagnostics, Robust, unless_overflown
@@ -146,6 +146,7 @@ def _derivatives(pose: SE3, X: Float[Array, "4"]) -> tuple[Float[Array, "2"], Fl
     return dehomogenise(x), J @ A, J @ jnp.concatenate([R, T[:, None]], axis=1)
 
 
+@checked
 def start(
     two_view: TwoView,
     first: Float[Array, "n 2"],
@@ -323,6 +324,7 @@ def begin(
     return ConsiderBelief(mean, belief.own, jnp.where(fresh[:, None], 0.0, belief.sensitivity))
 
 
+@checked
 def step(
     model: BaseFrames,
     belief: ConsiderBelief[BaseFramesState],
@@ -332,7 +334,7 @@ def step(
     slot: Int[Array, ""],
     dt: Float[Array, ""] | float = 1.0,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: Robust | None = None,
 ) -> tuple[ConsiderBelief[BaseFramesState], Diagnostics]:
     """One frame, which becomes the base frame in `slot` if `base` is True; the base frame that was there is released.

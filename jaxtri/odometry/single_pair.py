@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.checks import checked
 from jaxtri.estimation.two_view import TwoView, refine, scaled
 from jaxtri.filters import ekf
 from jaxtri.geometry.epipolar import inverse_depth, safe_norm
@@ -80,6 +81,7 @@ def _model(settings: Settings, epipole: Float[Array, "3"], depth: Float[Array, "
     return Trifocal(settings.sigma, linear, angular, drift, epipole, refine_base=True)
 
 
+@checked
 def init(
     settings: Settings,
     first: Float[Array, "n 2"],
@@ -126,6 +128,7 @@ def place(pose: Float[Array, "6 6"], log_scale: Float[Array, ""]) -> Float[Array
     return jnp.zeros((7, 7), pose.dtype).at[:6, :6].set(pose).at[6, 6].set(log_scale)
 
 
+@checked
 def step(
     settings: Settings,
     state: State,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtri.checks import checked
 from jaxtri.filters import ekf, projective
 from jaxtri.filters.masks import replace_masked, select, stand_in
 from jaxtri.filters.model import transition
@@ -86,6 +87,7 @@ def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
     return BasePairs(settings.sigma, settings.acceleration * depth, settings.angular_acceleration)
 
 
+@checked
 def init(
     settings: Settings,
     first: Float[Array, "n 2"],
@@ -163,6 +165,7 @@ def _rebase(settings: Settings, state: State, observed: Array, visible: Array) -
     return state._replace(tracks=moved, keyframes=keyframes, sensitivity=sensitivity, seen=observed, held=visible)
 
 
+@checked
 def step(
     settings: Settings,
     state: State,
@@ -251,6 +254,7 @@ def _only(tracks: Tracks, keep: Bool[Array, " n"]) -> Tracks:
     return tracks._replace(slots=slots, usable=tracks.usable & keep, fixed=tracks.fixed & keep)
 
 
+@checked
 def filter(
     settings: Settings,
     state: State,

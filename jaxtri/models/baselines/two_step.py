@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtri.checks import number
+from jaxtri.checks import checked, number
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf
 from jaxtri.filters.scan import checkpointed
@@ -94,6 +94,7 @@ class TwoStepBelief(eqx.Module):
     bank: Bank
 
 
+@checked
 def step(
     model: TwoStep,
     belief: TwoStepBelief,
@@ -101,7 +102,7 @@ def step(
     mask: Bool[Array, " n"],
     dt: Float[Array, ""] | float = 1.0,
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: ekf.Robust | None = None,
 ) -> tuple[TwoStepBelief, ekf.Diagnostics]:
     """One frame: the pose from the points as they are believed, then the points from the new pose."""
@@ -114,13 +115,14 @@ def step(
     return TwoStepBelief(camera, bank), diagnostics
 
 
+@checked
 def filter(
     model: TwoStep,
     belief: TwoStepBelief,
     observed: Float[Array, "t n 2"],
     mask: Bool[Array, "t n"],
     *,
-    passes: int = 4,
+    passes: int | None = None,
     robust: ekf.Robust | None = None,
     block: int = 1,
 ) -> tuple[TwoStepBelief, ekf.Diagnostics]:
