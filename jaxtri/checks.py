@@ -191,7 +191,7 @@ def _conform(
 ) -> Any:
     if value is None or isinstance(value, bool | int | float):
         return value
-    boolean = kinds[0].dtypes == ("bool",)
+    boolean = set(kinds[0].dtypes) <= {"bool", "bool_"}
     if not isinstance(value, jax.Array):
         if boolean:
             value = jnp.asarray(np.asarray(value))
