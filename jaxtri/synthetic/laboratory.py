@@ -13,7 +13,14 @@ YELLOW = (40, 200, 245)
 
 
 class Footage(NamedTuple):
-    """A scene, the camera that films it, the times in seconds and the true poses, camera to world (metres)."""
+    """A scene and how it is filmed.
+
+    Attributes:
+        scene: What is filmed.
+        camera: The camera, with the size of its images.
+        times: (t,) seconds.
+        T_world_camera: (t, 4, 4) float64, the true poses, camera to world, metres.
+    """
 
     scene: Scene
     camera: Camera
@@ -59,13 +66,10 @@ def blank_scene(*, depth: float = 2.0) -> Scene:
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula in float64, whatever JAX computes in: the truth is to be exact."""
-    angle = np.linalg.norm(vectors, axis=-1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    K = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), -1, 0)
-    # sinc(0) = 1 keeps the identity finite.
-    return np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K
+    """Matrices of rotation vectors, in float64 whatever JAX computes in: the truth is to be exact."""
+    from scipy.spatial.transform import Rotation  # loaded when it is needed: it takes time
+
+    return Rotation.from_rotvec(vectors).as_matrix()
 
 
 # Goods on the table: centre (x, z), size (x, y, z), yaw in degrees, colour.

@@ -13,7 +13,8 @@ from jaxtyping import Float, UInt8
 from jaxtri.errors import InputError
 from jaxtri.geometry.camera import Camera
 
-_NEAR = 1e-3
+_NEAR = 1e-3  # depth in the camera, in units of the scene, below which nothing is drawn: what is behind stays finite
+_EDGE_ON = 1e-12  # volume of corner and edges over the edges' lengths, below which a rectangle shows no face
 _FOOTPRINT = 1.2  # width in pixels over which a texture is averaged: a little more than one, against aliasing
 _CHUNK = 1 << 14  # samples shaded together, so that the temporaries stay in the cache
 
@@ -22,8 +23,14 @@ _CHUNK = 1 << 14  # samples shaded together, so that the temporaries stay in the
 class Quad:
     """A textured parallelogram: world point `corner` + u `edge_u` + v `edge_v`, with u and v in [0, 1].
 
-    u runs along the columns of the texture (BGR), v along its rows. It is seen only from the side from which
-    the texture is not mirrored.
+    It is seen only from the side from which the texture is not mirrored.
+
+    Attributes:
+        corner: (3,) its first corner in the world, units of the scene.
+        edge_u: (3,) its edge along the columns of the texture.
+        edge_v: (3,) its edge along the rows of the texture.
+        texture: (rows, columns, 3) uint8, BGR.
+        integral: (rows + 1, columns + 1, 3) sums of the texture over all texels above and to the left.
     """
 
     corner: Float[np.ndarray, "3"]
@@ -31,19 +38,29 @@ class Quad:
     edge_v: Float[np.ndarray, "3"]
     texture: UInt8[np.ndarray, "rows columns 3"]
     integral: Float[np.ndarray, "rows1 columns1 3"]
-    """Sums of the texture over all texels above and to the left."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Rectangles before a background of one colour (BGR)."""
+    """Rectangles before a background of one colour.
+
+    Attributes:
+        quads: The rectangles.
+        background: Blue, green, red, 0 to 255; a middle gray by default, against which dark and light both stand out.
+    """
 
     quads: tuple[Quad, ...]
     background: tuple[int, int, int] = (96, 96, 96)
 
 
 class Rendering(NamedTuple):
-    """An image (BGR) and the z of the surface in the camera's frame at every pixel centre, inf if there is none."""
+    """What the camera sees.
+
+    Attributes:
+        image: (h, w, 3) uint8, BGR.
+        depth: (h, w) z of the surface in the camera's frame at every pixel centre, units of the scene; inf where there
+            is none.
+    """
 
     image: UInt8[np.ndarray, "h w 3"]
     depth: Float[np.ndarray, "h w"]
@@ -143,9 +160,9 @@ def rendered_sequence(
     noise_gray: float = 0.0,
     seed: int = 0,
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """The images (BGR) along a trajectory, with Gaussian noise of the given deviation in gray levels.
+    """The images (BGR) along a trajectory, with Gaussian noise of the given standard deviation in gray levels.
 
-    Rendered ahead by two threads, since nearly all of it is NumPy's.
+    They are rendered ahead by two threads, since nearly all of the work is NumPy's.
     """
     rays = pixel_rays(camera)
 
@@ -174,7 +191,7 @@ class _Face(NamedTuple):
         c, a, b = T[:3, :3] @ q.corner + T[:3, 3], T[:3, :3] @ q.edge_u, T[:3, :3] @ q.edge_v
         volume = np.cross(a, b) @ c
         corners = np.array([c, c + a, c + b, c + a + b])
-        if volume <= 1e-12 * np.linalg.norm(a) * np.linalg.norm(b) or (corners[:, 2] < _NEAR).all():
+        if volume <= _EDGE_ON * np.linalg.norm(a) * np.linalg.norm(b) or (corners[:, 2] < _NEAR).all():
             return None  # from behind or edge-on, or behind the camera
         M = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / volume
         if (corners[:, 2] < _NEAR).any():
