@@ -94,8 +94,8 @@ def undistort(distortion: BrownConrady | Fisheye, xy: Float[Array, "2"]) -> Floa
 
     Derivatives with respect to the point and the coefficients are those of the implicit function theorem,
     to first order. A point that no ray reaches (beyond the fold of a barrel distortion, or 90 degrees and
-    more off the axis) gives the nearest reachable one that was found, with derivatives of zero;
-    distorting the result again tells.
+    more off the axis) gives the nearest reachable one that was found, with derivatives of zero. To find out,
+    distort the result again.
     """
     # The loop is not differentiated: one Newton step from its result has the derivatives, whatever path
     # led there, and reverse mode keeps nothing of the path.

@@ -132,7 +132,7 @@ class BaseFrames(eqx.Module):
 
 
 def _of_pose(motion: Kinematics | Twist) -> Float[Array, "6 12"]:
-    """Derivative of the error of the pose, a left perturbation, with respect to that of the motion."""
+    """Derivative of the error of the pose, a left perturbation, with respect to the error of the motion."""
     pose = motion.pose
     return jax.jacfwd(lambda e: local(pose, retract(motion, e).pose))(jnp.zeros(12, pose.wxyz_xyz.dtype))
 
@@ -162,7 +162,8 @@ def start(
     """The belief at the second of `k` base frames, `frames` after the first, from a two-view estimate.
 
     `mask` marks the pairs of normalised image points that the estimate was made from, `sigma` is their noise. The
-    points are those of the transfer (Yu et al. 2006, eqs 7-9).
+    velocity and its standard deviations are as in `jaxtri.models.motion.from_two_view`. The points are those of the
+    transfer (Yu et al. 2006, eqs 7-9).
     """
     motion, _, of_motion, variance = from_two_view(
         two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd

@@ -88,7 +88,7 @@ class Depth(eqx.Module):
 
     @classmethod
     def of(cls, sigma: Float[Array, ""], *, gate: Float[Array, ""] | float = jnp.inf, rays: bool = True) -> "Depth":
-        """The default: inverse depth, the ray estimated (or, with `rays` False, considered), no drift."""
+        """The default model: inverse depth, the ray estimated (or, with `rays` False, considered), no drift."""
         sigma = number(sigma)
         return cls(sigma, sigma, jnp.zeros_like(sigma), jnp.asarray(gate, sigma.dtype), rays)
 
@@ -96,7 +96,7 @@ class Depth(eqx.Module):
     def paper(
         cls, sigma: Float[Array, ""], *, drift: Float[Array, ""] | float = 0.01, inverse: bool = False
     ) -> "Depth":
-        """As published: depth along an exact ray, one pass, process noise because the start is a plane.
+        """The model as published: depth along an exact ray, one pass, process noise because the start is a plane.
 
         With `inverse` the parameter is the inverse depth instead, in which the projection is all but linear. As a
         depth, a point far from the plane is thrown off by its first update and may never come back.
@@ -177,7 +177,7 @@ class Depth(eqx.Module):
                 return turned + x[0] * b if self.inverse else x[0] * turned + b
 
             def moved(error: Array) -> Array:
-                # The left perturbation of the pose, to first order, of the point as it is believed.
+                # What a left perturbation of the pose does, to first order, to the point as it is believed.
                 X = camera(prior)
                 return dehomogenise(X + (parameter if self.inverse else 1.0) * error[:3] + jnp.cross(error[3:], X))
 
@@ -241,8 +241,8 @@ class Depth(eqx.Module):
     def triangulated(self, two_view: TwoView, first: Float[Array, "n 2"], second: Float[Array, "n 2"]) -> Bank:
         """The bank at the first of two views, the world, from their relative pose: the good start.
 
-        `first` and `second` are normalised image points. A point's variance is that of its triangulation, the uncertain
-        pose included. What the errors of the points have in common is left out.
+        `first` and `second` are normalised image points. A point's variance is that of its triangulation, and counts
+        the error of the pose. What the errors of the points have in common is left out.
         """
         parameter, by_pose, by_noise = triangulate(two_view, first, second, inverse=self.inverse)
         spread = jnp.square(self.ray_sigma) * jnp.sum(by_noise[:, :2] ** 2, axis=1)
@@ -296,7 +296,7 @@ def scale_variance(
     G = jnp.concatenate([depth[:, None], by_pose], axis=1)
     A = jnp.einsum("n,ni,nj->ij", weight, G, G)
     C, App = two_view.covariance, A[1:, 1:]
-    # The errors of the pose eliminated; its covariance is singular along the base line.
+    # The errors of the pose are eliminated; their covariance is singular along the base line.
     eliminated = C @ jnp.linalg.solve(jnp.eye(6, dtype=C.dtype) + App @ C, A[1:, 0])
     return 1 / (A[0, 0] - A[0, 1:] @ eliminated)
 

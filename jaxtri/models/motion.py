@@ -69,11 +69,11 @@ class Kinematics(eqx.Module):
     def pose_covariance(self, covariance: Float[Array, "d d"]) -> Float[Array, "6 6"]:
         """Covariance of the pose, as that of its left perturbation (linear, angular).
 
-        `covariance` is that of a state whose first 12 errors are those of this one.
+        `covariance` is that of a whole state, whose first 12 error components are those of this motion.
         """
         J = shear(self.translation)
         if not isinstance(self.rotation, SO3):
-            # A rate of the angles as one of the rotation, in camera axes: [w]x = dR R'.
+            # From a rate of the angles to a rate of the rotation, in camera axes: [w]x = dR R'.
             dR = jax.jacfwd(matrix_from_euler)(self.rotation)
             W = jnp.einsum("ijk,lj->ilk", dR, self.R)
             J = J @ jax.scipy.linalg.block_diag(jnp.eye(3, dtype=J.dtype), jnp.stack([W[2, 1], W[0, 2], W[1, 0]]))
@@ -137,7 +137,7 @@ def from_two_view(
     if euler:
         rotation = euler_from_matrix(R.as_matrix())
         rate = rotation / frames
-        # From the error in camera axes to one of the angles.
+        # From the error in camera axes to an error of the angles.
         J = jax.jacfwd(lambda d: euler_from_matrix((SO3.exp(d) @ R).as_matrix()))(jnp.zeros(3, dtype))
         J = jax.scipy.linalg.block_diag(jnp.eye(3, dtype=dtype), J)
         C = J @ C @ J.T
@@ -151,7 +151,11 @@ def from_two_view(
 def at_rest(
     dtype: jnp.dtype, *, velocity_sd: Float[Array, ""] | float, angular_velocity_sd: Float[Array, ""] | float
 ) -> Belief[Kinematics]:
-    """The camera in the first frame, the world: its pose is exact, its velocity all but unknown."""
+    """The camera in the first frame, which is the world: its pose is exact, its velocity is zero, give or take.
+
+    `velocity_sd` and `angular_velocity_sd` are the standard deviations of the velocity, scene units and radians per
+    frame.
+    """
     zero = jnp.zeros(3, dtype)
     rotation = identity(dtype).rotation()
     variance = _velocity(dtype, velocity_sd, angular_velocity_sd)
@@ -168,8 +172,8 @@ def acceleration_noise(
 ) -> Float[Array, "12 12"]:
     """Process noise of a white acceleration, constant within a step, in the error order of `Kinematics`.
 
-    `linear` and `angular` are its standard deviations (per frame squared). `Twist` keeps another order: see
-    `twist_noise`. Source: Bar-Shalom, Li & Kirubarajan 2001, section 6.3.2.
+    `linear` and `angular` are its standard deviations, scene units and radians per frame squared. `Twist` keeps another
+    order: see `twist_noise`. Source: Bar-Shalom, Li & Kirubarajan 2001, section 6.3.2.
     """
     step = jnp.outer(jnp.stack([dt**2 / 2, dt]), jnp.stack([dt**2 / 2, dt]))
     zero = jnp.zeros((6, 6), step.dtype)

@@ -148,7 +148,7 @@ class Trifocal(eqx.Module):
     def noise(self, mean: TrifocalState, item: Float[Array, "4"]) -> Float[Array, "2 2"]:
         """sigma^2 (I + J J'), J the derivative of the transfer with respect to the two base points.
 
-        With `base_noise` off the constant sigma^2 I of the paper.
+        Without `base_noise` it is sigma^2 I, as in the paper.
         """
         noise = jnp.eye(2, dtype=item.dtype)
         if self.base_noise:
@@ -205,9 +205,10 @@ def start(
 ) -> Belief[TrifocalState]:
     """The belief at the second base frame, `frames` after the first, from a two-view estimate.
 
-    The current pose and the base pose are one pose at that moment: its covariance enters both blocks fully
-    correlated. The velocity is that between the two frames, with the given standard deviations (scene
-    units and radians per frame). With `euler` rotations are the paper's yaw, pitch and roll.
+    The current pose and the base pose are one pose at that moment: its covariance enters both blocks fully correlated.
+    The velocity is the motion between the two frames over `frames`. `velocity_sd` and `angular_velocity_sd` (scene
+    units and radians per frame) are the standard deviations of the error that it has beside that of the pose. With
+    `euler` rotations are the paper's yaw, pitch and roll.
     """
     motion = from_two_view(
         two_view, frames=frames, velocity_sd=velocity_sd, angular_velocity_sd=angular_velocity_sd, euler=euler

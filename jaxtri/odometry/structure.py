@@ -13,7 +13,7 @@ from jaxtri.models.depth import Bank
 from jaxtri.odometry.measuring import FARTHEST, structure_model
 from jaxtri.odometry.settings import Settings
 
-_KNOWN = 3.0  # standard deviations by which the inverse depth of a known point is above zero: to a third of itself
+_KNOWN = 3.0  # standard deviations by which the inverse depth of a known point is above zero: it is known to a third
 
 
 class Points(NamedTuple):

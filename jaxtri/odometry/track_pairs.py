@@ -144,7 +144,7 @@ def _rebase(settings: Settings, state: State, observed: Array, visible: Array) -
     tracks, belief = state.tracks, state.belief
     slot, pose = state.keyframes.slot, belief.mean.pose
     keyframes, sensitivity = add(state.keyframes, pose, belief.covariance[:6, :6], state.sensitivity)
-    # A waiting track whose first base frame is overwritten starts again; a fixed one stands on its point alone.
+    # A waiting track whose first base frame is overwritten starts again; a fixed one has its point, and needs no more.
     slots = jnp.where(tracks.slots == slot, -1, tracks.slots)
     waiting = visible & (slots[:, 0] >= 0) & ~tracks.fixed
     ones = jax.tree.map(lambda all_: all_[jnp.maximum(slots[:, 0], 0)], keyframes.poses)
@@ -180,7 +180,7 @@ def step(
     """One frame: predict, update with the tracks that have a base pair, keep a keyframe when it is time.
 
     `observed` are normalised points in slots, `visible` the slots that hold one, `fresh` those whose track
-    begins here (whatever the slot held before is forgotten). `hold` makes no keyframe. `quality` is what
+    begins here (whatever the slot held before is forgotten). With `hold` no keyframe is made. `quality` is what
     `settings.point_noise` asks for. Where too few points agree the state is the prediction and the status says so.
     """
     observed = jnp.where(visible[:, None], observed, jnp.zeros((), observed.dtype))

@@ -230,7 +230,7 @@ def _shade(
     y: np.ndarray,
     pixel: tuple[float, float],
 ) -> np.ndarray:
-    """Colours of traced rays, each the mean of the texture over the footprint of a pixel."""
+    """Colours of traced rays; each is the mean of the texture over the footprint of a pixel."""
     colours = np.empty((owner.size, 3))
     colours[:] = background
     flat, x, y = owner.ravel(), x.ravel(), y.ravel()

@@ -196,7 +196,7 @@ def hypotheses(
     wanted = np.isin(np.arange(HYPOTHESES), _distinct(rough, worst=WORST))
     R = rough.pose.rotation.as_matrix()
     fine = _refine(R, rough.pose.translation, first, second, rough.inside, wanted, common, sigma)
-    fine = jax.tree.map(np.asarray, fine)  # to take it apart there: here each index would be a program of its own
+    fine = jax.tree.map(np.asarray, fine)  # taken apart by NumPy: in JAX each index would be a program of its own
     return [
         Hypothesis(
             jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), fine.pose),
@@ -212,7 +212,7 @@ def _distinct(refined: _Refined, worst: float = np.inf) -> list[int]:
     """Which hypotheses differ, the cheapest first; none that costs more than `worst` times the best."""
     cost, poses = np.asarray(refined.cost), jax.tree.map(np.asarray, refined.pose)
     each = [jax.tree.map(lambda x, k=k: x[k], poses) for k in range(len(cost))]
-    order = np.argsort(cost)  # what is not a number comes last
+    order = np.argsort(cost)  # NaN comes last
     dearest = worst * max(cost[order[0]], 1.0)
     found: list[int] = []
     for k in order:

@@ -11,7 +11,7 @@ from jaxtri.errors import ResolutionChangeError
 
 STEPS, CLOSE = 30, 0.003  # optical flow ends after so many steps, or when a step is shorter than so many pixels
 BLOCK = 5  # pixels across, over which the strength of a corner is summed: a corner, and not the noise of one pixel
-MOST = 0.9  # share of the points whose way there was no longer than what the way back has to reach
+MOST = 0.9  # share of the points whose flow the way back must reach: for the few longest all would take a level more
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class KLTSettings:
     """How features are found and followed; lengths in pixels of the image.
 
     The defaults were found on the sequences of `benchmarks/real_sequences.py`. Patches of 11 to 15 pixels and 600 to
-    1,000 features change the errors there by a third, without order: neither is sharply tuned.
+    1,000 features gave 0.68 to 0.95 times the error of `pnp` there, with no best among them.
 
     Attributes:
         capacity: Slots for features; also the most that are followed at once. More take longer, in proportion, and make

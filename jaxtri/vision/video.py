@@ -150,9 +150,9 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
 
     Raises VideoError if there is nothing to read, the file is no video, or the time stamps do not fit the
     images; ResolutionChangeError, while iterating, if the frame size changes (OpenCV's FFmpeg reader hides
-    such a change by rescaling; there it goes unseen). A frame that cannot be decoded is skipped, and a source
-    that ends early ends early: one TruncatedVideoWarning at the end gives both counts, or, with `strict`, a
-    TruncatedVideoError is raised at once.
+    such a change by rescaling; there it goes unseen). A frame that cannot be decoded is skipped. Where
+    frames are missing, or the source ends early, one TruncatedVideoWarning at the end says how many were decoded of how
+    many; with `strict` a TruncatedVideoError is raised at once.
     """
     if fps is not None and not (math.isfinite(fps) and fps > 0):
         raise VideoError(f"fps is {fps}; give frames a second as a positive number")
@@ -172,8 +172,8 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
 def ahead(frames: Iterable[Frame], depth: int = 4) -> Generator[Frame, None, None]:
     """The same frames, read by a thread of their own, up to `depth` of them before they are asked for.
 
-    What the source raises is raised where its frame would have come. Close it (`contextlib.closing`) when leaving
-    early: the thread has let go of the source then.
+    What the source raises is raised where its frame would have come. Close the generator (`contextlib.closing`) when
+    you leave early: after that the thread no longer uses the source.
     """
     ready: Queue[Frame | BaseException | None] = Queue(depth)
     left = Event()
@@ -204,7 +204,7 @@ def ahead(frames: Iterable[Frame], depth: int = 4) -> Generator[Frame, None, Non
 
 
 def spool(frames: Iterable[Frame], folder: Path) -> Iterator[Frame]:
-    """Pass the frames of a camera on, kept as JPEG files with their times, for whoever needs them again."""
+    """Pass the frames of a camera on, and keep them in `folder` as JPEG files with their times."""
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "timestamps.txt", "w") as stamps:
         for frame in frames:
