@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import cv2
@@ -49,6 +50,7 @@ def test_track_writes_everything_and_evaluate_reads_it(sequence, tmp_path, capsy
     run = json.loads((out / "run.json").read_text())
     assert run["statistics"]["status"] == {"tracking": 24}
     assert run["settings"]["noise_px"] == 0.4
+    assert run["settings"]["starts"] == "opencv"
     assert "jax" in run["versions"]
     video = cv2.VideoCapture(str(out / "overlay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 24
@@ -58,6 +60,22 @@ def test_track_writes_everything_and_evaluate_reads_it(sequence, tmp_path, capsy
     errors = json.loads((out / "e.json").read_text())
     assert errors["ate_percent"] < 0.5
     assert errors["rotation_rmse_deg"] < 0.1
+
+
+def test_starts_by_poselib_are_in_the_record(sequence, tmp_path, monkeypatch):
+    """With a stand-in for PoseLib that finds nothing, so that the extra need not be there."""
+    nothing = types.SimpleNamespace(R=np.full((3, 3), np.nan), t=np.zeros(3))
+    asked = []
+
+    def estimate(*arguments):
+        asked.append(arguments)
+        return nothing, {}
+
+    monkeypatch.setitem(sys.modules, "poselib", types.SimpleNamespace(estimate_relative_pose=estimate))
+    options = ["--camera", str(sequence / "camera.json"), "--out", str(tmp_path), "--quiet", "--no-overlay"]
+    main(["track", str(sequence), *options, "--starts", "poselib"])
+    assert asked
+    assert json.loads((tmp_path / "run.json").read_text())["settings"]["starts"] == "poselib"
 
 
 def test_a_video_file_with_a_field_of_view_and_a_place(sequence, tmp_path, capsys):
