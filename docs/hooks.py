@@ -14,6 +14,7 @@ _FORMULA = re.compile(r"(?<![\\$\w])\$([^$<>\n]{1,60})\$(?!\w)")
 # jaxtyping's shapes as they were written: a string, without the leading blank that is for linters.
 _LENGTH = re.compile(r'((?:Array|ndarray)</span><span class="p">,</span> <span class=")mi">(\d+)</span>')
 _SHAPE = re.compile(r"""<span class="s[12]">(?:&quot;|&#39;|"|') ?([^&"'<]*)(?:&quot;|&#39;|"|')</span>""")
+_LISTED = re.compile(r"""((?:Array|ndarray)</span>, )(?:(?:&#39;|') ?([^&'<]*)(?:&#39;|')|(\d+))(?=\])""")
 _ELSEWHERE = re.compile(r'<(?:script|link|img)[^>]*\s(?:src|href)="(?:https?:)?//[^"]+"')
 
 
@@ -39,6 +40,7 @@ def on_post_page(output, page, config):
         output = _FORMULA.sub(_formula, output)
     if page.file.src_uri.startswith("reference/"):
         output = _LENGTH.sub(r'\1s2">&quot;\2&quot;</span>', output)
+        output = _LISTED.sub(lambda m: f"{m[1]}&quot;{m[2] or m[3] or ''}&quot;", output)
         output = _SHAPE.sub(r'<span class="s2">&quot;\1&quot;</span>', output)
     if found := _ELSEWHERE.search(output):
         log.warning("%s loads from another host: %s", page.file.src_uri, found[0])
