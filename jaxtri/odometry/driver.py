@@ -114,6 +114,10 @@ class Odometry(Archived):
         self.start = self.start or StartSettings.of(self.base)
         self._recorder = Recorder(self.record)
 
+    def __getstate__(self) -> dict:
+        # A thread cannot be kept: what it works out is begun again, with the same outcome.
+        return self.__dict__ | {"_search": None}
+
     @property
     def _settings(self) -> Settings:
         assert self.settings is not None
@@ -245,8 +249,8 @@ class Odometry(Archived):
         dtype = self._settings.sigma.dtype
         u = np.asarray(_normalise(self.camera, tracks.pixels.astype(dtype)))
         tracks = tracks._replace(visible=tracks.visible & np.isfinite(u).all(axis=1))
-        quality_ = tracks.quality.astype(dtype)
-        return Observations(index, float(time), u, tracks.visible, tracks.ids, quality_), tracks, rows
+        observed = Observations(index, float(time), u, tracks.visible, tracks.ids, tracks.quality.astype(dtype))
+        return observed, tracks, rows
 
     def _dt(self, index: int) -> float:
         if index == 0 or not self.frame_time:
@@ -275,8 +279,6 @@ class Odometry(Archived):
             if self.poses[frame.index].status is Status.LOST:
                 self._lose(frame)
         return np.concatenate(outliers or [np.zeros(0, np.int64)])
-
-    # -- starting ---------------------------------------------------------------------------------------------
 
     def _try_start(self) -> None:
         """Look for a base pair between the first waiting frame and the newest."""

@@ -17,13 +17,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters.scan import checkpointed
+from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import compose, shear
 from jaxtri.odometry import single_pair, track_pairs
 from jaxtri.odometry.settings import Report, Settings
 
 
-class Recording(eqx.Module):
+class Recording(eqx.Module, Archived):
     """Feature tracks in slots, from the first base frame on, and the base pairs of all segments, in order.
 
     A single pair per run, as `tracks` needs it, is a recording of one segment. Frames count from the first one here.
