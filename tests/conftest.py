@@ -9,20 +9,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "agg")
 os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # the command line's, in the home of whoever runs the tests
 
-# The suite spends its time compiling, not computing.
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-if version("jaxlib").startswith("0.10."):  # an unknown flag would end the process
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+# JAXTRI_AS_USERS=1: what users have, programs that are optimised and annotations that nobody checks.
+if os.environ.get("JAXTRI_AS_USERS") != "1":
+    # The suite spends its time compiling, not computing.
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    if version("jaxlib").startswith("0.10."):  # an unknown flag would end the process
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
-from jaxtyping import install_import_hook
+    from jaxtyping import install_import_hook
 
-# The numeric tower: an int may stand where a float is asked for, as Python has it.
-with install_import_hook("jaxtri", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"):
-    import jaxtri
+    # The numeric tower: an int may stand where a float is asked for, as Python has it.
+    with install_import_hook("jaxtri", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"):
+        import jaxtri
 
-    # All of it: what is loaded later would not be checked.
-    for module in pkgutil.walk_packages(jaxtri.__path__, "jaxtri."):
-        importlib.import_module(module.name)
+        # All of it: what is loaded later would not be checked.
+        for module in pkgutil.walk_packages(jaxtri.__path__, "jaxtri."):
+            importlib.import_module(module.name)
 
 import jax
 import pytest

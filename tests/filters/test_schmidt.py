@@ -86,7 +86,7 @@ class Textbook:
         return -(r @ np.linalg.solve(S, r) + log_det) / 2, r @ np.linalg.solve(S, r)
 
 
-@pytest.mark.parametrize("passes", [1, 3])
+@pytest.mark.parametrize("passes", [1, pytest.param(3, marks=pytest.mark.as_users)])
 def test_equals_the_textbook_filter(problem, passes):
     model, belief, items, observed, mask = problem
     beliefs, diagnostics = jax.jit(partial(schmidt.filter, passes=passes))(model, belief, items, observed, mask)

@@ -62,6 +62,25 @@ def test_a_replay_is_the_run(base):
     agrees(odometry, recording, again(TRACKS.camera, SETTINGS, recording))
 
 
+@pytest.mark.as_users
+def test_the_slope_by_the_noise_is_that_of_differences():
+    """In forward mode, as one number is fitted."""
+    _, recording = live(Base.TRACKS)
+    recording = recording.until(10)
+
+    def loss(x):
+        settings = eqx.tree_at(lambda s: s.sigma, SETTINGS, SETTINGS.sigma * jnp.exp(x))
+        report = replay.tracks(TRACKS.camera, settings, recording)
+        return replay.negative_log_likelihood(TRACKS.camera, recording, report)
+
+    value = jax.jit(lambda x: jax.jvp(loss, (x,), (jnp.ones(()),)))
+    at, h = 0.5, 1e-5  # a noise too large, where there is a slope
+    (up, _), (down, _) = value(jnp.asarray(at + h)), value(jnp.asarray(at - h))
+    slope = value(jnp.asarray(at))[1]
+    np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-5)
+    assert slope > 0.1
+
+
 def test_the_gradient_through_a_restart_is_that_of_differences():
     """With the hand-over of the scale, from the intrinsics to the poses and the likelihood."""
     odometry, recording = live(Base.PAPER, overlap=2)

@@ -5,14 +5,31 @@ import time
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from footage import clip
 
 from jaxtri.formats import read_camera
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.run import track
-from jaxtri.odometry.settings import Settings, StartSettings
+from jaxtri.odometry.settings import Settings, StartSettings, Status
 from jaxtri.synthetic.rendered import write_laboratory
+from jaxtri.trajectory import evaluate
 from jaxtri.vision.klt import KLT, KLTSettings
 from jaxtri.vision.video import open_source
+
+
+@pytest.mark.as_users
+def test_twenty_frames_are_enough_for_a_trajectory_and_its_points():
+    camera, frames, truth = clip()
+    run = track(frames, camera, klt=KLTSettings(capacity=128), progress=False)
+    assert set(run.trajectory.status) == {Status.TRACKING}
+    found = evaluate(run.trajectory, truth)
+    # 0.4 px at 280 px and 1.2 m away is 1.7 mm; the path is half a metre long.
+    assert found.ate_percent < 1
+    assert found.rotation_rmse_deg < 0.2
+    assert len(run.points.ids) > 100
+    assert run.colours.shape == run.points.xyz.shape
+    assert run.statistics["frames"] == len(frames)
 
 
 def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatch):
