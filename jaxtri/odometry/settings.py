@@ -158,8 +158,8 @@ class StartSettings:
         points: Fewest tracks that must agree on the motion. Higher refuses starts that chance agreement may have made.
         common: Share of the first frame's tracks that must be left in the second. Below it a later frame becomes the
             first one.
-        restart: Share of a pair's tracks below which a new pair is made (`Base.INHERIT`, `Base.PAPER`). An optimum:
-            higher makes base lines too short, lower leaves too few tracks to measure with.
+        restart: Share of a pair's tracks below which a new pair is made (`Base.INHERIT`, `Base.PAPER`). An optimum in a
+            prototype: higher makes base lines too short, lower leaves too few tracks to measure with.
         overlap: How many frames back a new pair begins (`Base.PAPER`): 1 takes the frame before, as in the paper.
         lag: Frames that queue up while a start is worked out in a thread; its poses are known so many frames later. A
             start takes about 0.1 seconds, less than 16 frames do: no frame waits. 0 waits for every start.

@@ -19,11 +19,10 @@ class KLTSettings:
     """How features are found and followed; lengths in pixels of the image.
 
     The defaults were found on the sequences of `benchmarks/real_sequences.py`. Patches of 11 to 15 pixels and 600 to
-    1,000 features gave 0.68 to 0.95 times the error of `pnp` there, with no best among them.
+    1,000 features gave 0.68 to 0.95 times the error of `pnp` there.
 
     Attributes:
-        capacity: Slots for features; also the most that are followed at once. More take longer, in proportion, and make
-            the poses more exact as long as they are on different things.
+        capacity: Slots for features; also the most that are followed at once. More take longer, and average more noise.
         quality: Smallest corner strength, as a share of the best corner's. Low, so that a bright corner does not starve
             the rest of the image; the filter leaves out what turns out to be none. Lower finds more and weaker corners.
         spacing: Smallest distance between two new features. Smaller lets patches overlap, whose errors are then alike.
