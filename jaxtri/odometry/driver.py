@@ -153,7 +153,8 @@ class Odometry(Archived):
             self.frame_time = frame.time - self.poses[-1].time
         self._held = tracks.ids
         self._recorder.take(tracks)
-        self.poses.append(FramePose(frame.time, Status.LOST if self.starts else Status.INITIALISING))
+        lost = self.starts > 0 and self._follower is None  # else it only waits for its turn
+        self.poses.append(FramePose(frame.time, Status.LOST if lost else Status.INITIALISING))
         self._queue.append(frame)
         return np.isin(ids, self._take_in(index, CATCH_UP))
 
@@ -249,8 +250,8 @@ class Odometry(Archived):
         dtype = self._settings.sigma.dtype
         u = np.asarray(_normalise(self.camera, tracks.pixels.astype(dtype)))
         tracks = tracks._replace(visible=tracks.visible & np.isfinite(u).all(axis=1))
-        observed = Observations(index, float(time), u, tracks.visible, tracks.ids, tracks.quality.astype(dtype))
-        return observed, tracks, rows
+        quality = tracks.quality.astype(dtype)
+        return Observations(index, float(time), u, tracks.visible, tracks.ids, quality), tracks, rows
 
     def _dt(self, index: int) -> float:
         if index == 0 or not self.frame_time:
