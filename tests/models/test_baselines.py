@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from intervals import nees_interval
 from jaxlie import SO3
 
 from jaxtri.estimation.bound import filtering_bound
@@ -68,7 +69,11 @@ def test_full_covariance_filter_reaches_the_bound(begun):
     squared, nees, bound = jax.jit(lambda b: jax.lax.map(one, b))(begun)
     ratio = np.sqrt(np.mean(squared, axis=0) / np.mean(bound, axis=0))
     assert 0.7 < np.median(ratio) < 1.3
-    assert 4 < np.mean(nees) < 12  # the noise of the first image is taken as new in every frame
+    # The correlation time of the NEES is three frames. The noise of the first image is taken as new in every frame:
+    # .848 of the poses are inside the 95 % region in the end (`ap_good` in benchmarks/consistency.py), as where the
+    # NEES is 1.35 times what it should be.
+    low, high = nees_interval(6, nees.size / 3)
+    assert low < np.mean(nees) < 1.35 * high
 
 
 def test_two_step_filter_is_accurate_and_over_confident(begun):
@@ -138,7 +143,9 @@ def test_pose_before_a_known_scene_is_consistent(begun):
         return errors(e, beliefs.mean, beliefs.covariance)
 
     _, nees = jax.jit(lambda x: jax.lax.map(one, x))(begun[0])
-    assert 4.5 < np.mean(nees) < 7.5
+    # The motion is drawn anew in every frame, so that errors are forgotten within two.
+    low, high = nees_interval(6, nees.size / 2)
+    assert low < np.mean(nees) < high
 
 
 def test_structure_noise_is_that_of_the_point(begun):

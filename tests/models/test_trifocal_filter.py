@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from intervals import nees_interval
 from jaxlie import SE3, SO3
 
 from jaxtri.estimation.two_view import refine
@@ -77,7 +78,10 @@ def test_default_mode_on_the_experiment_of_the_paper(trials):
     rotation, translation, nees, _ = trials[False]
     assert rotation.mean() <= 0.0060
     assert translation.mean() <= 0.25e-3
-    assert 4 < np.median(nees) < 9
+    # The frames of a run share the errors of its base pair: their means vary from run to run as those of one frame in
+    # six would. Slightly over-confident: 6.3 over 200 runs (`paper` in benchmarks/consistency.py), 1.05 times 6.
+    low, high = nees_interval(6, nees.size / 6)
+    assert low < np.mean(nees) < 1.05 * high
 
 
 def test_default_mode_gains_much_over_the_mode_of_the_paper(trials):
