@@ -116,14 +116,8 @@ def fit(
     Raises `InputError` where a parameter cannot be fitted as it stands or the loss at the start is not finite.
     """
     parameters = _parameters(parameters)
-    if not parameters or starts < 1:
-        raise InputError(f"{len(parameters)} parameters and {starts} starts: a fit wants at least one of each")
-    if not callable(loss):
-        raise InputError(f"loss is a {type(loss).__name__}; give a function of the model and the data")
-    leaves = {name: jnp.asarray(p.where(model)) for name, p in parameters.items()}
-    for name, p in parameters.items():
-        if p.log and not bool(jnp.all(leaves[name] > p.floor)):
-            raise InputError(f"{name} is {leaves[name]}: to be fitted by its logarithm it must be above {p.floor:g}")
+    _check(parameters, loss, starts)
+    leaves = _leaves(model, parameters)
     first = {name: p.free(leaves[name]) for name, p in parameters.items()}
     objective = _Objective(model, first, jnp.asarray(-1), jnp.asarray(1.0), Stable(loss), tuple(parameters.items()))
     before = float(_evaluate(objective, first, data))
@@ -140,10 +134,7 @@ def fit(
 
     with _bar(starts * max_steps, progress) as bar:
         for k in range(starts):
-            at = first
-            if k:
-                keys = dict(zip(first, jax.random.split(jax.random.fold_in(key, k), len(first)), strict=True))
-                at = {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
+            at = _drawn(first, spread, jax.random.fold_in(key, k)) if k else first
             scale, left, value = 0.0, max_steps, reached(at) if k else before
             while scale < 1 and left > 0:  # again from where the slope is less steep
                 scale = min(1.0, max(first_step / _slope(reached, at, value), 10 * scale))
@@ -170,6 +161,28 @@ def _parameters(given: Any) -> dict[str, Parameter]:
         if not isinstance(parameter, Parameter):
             raise InputError(f"parameters[{name!r}] is a {type(parameter).__name__}; give a Parameter, {example}")
     return {name: replace(p, where=Stable(p.where)) for name, p in given.items()}
+
+
+def _check(parameters: Mapping[str, Parameter], loss: object, starts: int) -> None:
+    if not parameters or starts < 1:
+        raise InputError(f"{len(parameters)} parameters and {starts} starts: a fit wants at least one of each")
+    if not callable(loss):
+        raise InputError(f"loss is a {type(loss).__name__}; give a function of the model and the data")
+
+
+def _leaves(model: Any, parameters: Mapping[str, Parameter]) -> dict[str, Array]:
+    """The leaves to fit, by name; raises `InputError` where one cannot be fitted as it stands."""
+    leaves = {name: jnp.asarray(p.where(model)) for name, p in parameters.items()}
+    for name, p in parameters.items():
+        if p.log and not bool(jnp.all(leaves[name] > p.floor)):
+            raise InputError(f"{name} is {leaves[name]}: to be fitted by its logarithm it must be above {p.floor:g}")
+    return leaves
+
+
+def _drawn(first: Mapping[str, Array], spread: float, key: Array) -> dict[str, Array]:
+    """Another start about the first."""
+    keys = dict(zip(first, jax.random.split(key, len(first)), strict=True))
+    return {n: x + spread * jax.random.normal(keys[n], x.shape, x.dtype) for n, x in first.items()}
 
 
 class _Objective(eqx.Module):

@@ -1,5 +1,6 @@
 """Maximum-likelihood pose of two views, with its covariance: the initial belief of every filter here."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -102,13 +103,7 @@ def refine(
     basis = tangent_basis(translation / length)
     valid = mask.astype(dtype)
     u1, u2 = (jnp.where(mask[:, None], u, jnp.zeros((), dtype)) for u in (u1, u2))
-    root = None
-    if prior is not None:
-        lift = jax.scipy.linalg.block_diag(basis.T / length, jnp.eye(3, dtype=dtype))
-        known = lift @ prior @ lift.T
-        s = jnp.sqrt(jnp.diagonal(known))
-        scaled = jnp.linalg.cholesky(known / jnp.outer(s, s))
-        root = jax.scipy.linalg.solve_triangular(scaled, jnp.diag(1 / s), lower=True)
+    root = None if prior is None else _root_of_information(prior, basis, length)
 
     def pose(x: Float[Array, "5"]) -> tuple[Array, SO3]:
         T = translation / length + basis @ x[:2]
@@ -120,26 +115,12 @@ def refine(
         return jax.vmap(lambda a, b: sampson(E, a, b))(u1, u2) / sigma * valid
 
     def residuals(x: Float[Array, "5"], _: None) -> Array:
-        d = distances(x)
-        large = jnp.abs(d) > huber
-        # sqrt of twice the Huber loss, so that least squares minimises it.
-        safe = jnp.where(large, jnp.abs(d), huber)
-        r = jnp.where(large, jnp.sign(d) * jnp.sqrt(2 * huber * safe - huber**2), d)
+        r = _huberised(distances(x), huber)
         return r if root is None else jnp.concatenate([r, root @ x])
 
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
-    solver = eqx.tree_at(lambda s: s.search, solver, _InOneDtype(solver.search))
-    solution = optx.least_squares(residuals, solver, jnp.zeros(5, dtype), max_steps=max_steps, throw=False)
-    # One Newton step from where it ended, which is not differentiated, has the derivatives of the minimum, and what
-    # the tolerance left open does not spread in differences of the result.
-    x = jax.lax.stop_gradient(solution.value)
-    slope = jax.grad(lambda y: jnp.sum(jnp.square(residuals(y, None))) / 2)
-    step = jnp.linalg.solve(jax.lax.stop_gradient(jax.jacfwd(slope)(x)), slope(x))
-    x = x - jnp.where(jnp.all(jnp.isfinite(step)), step, 0)
+    x, successful = _least_squares(residuals, jnp.zeros(5, dtype), max_steps)
     J = jax.jacfwd(lambda y: residuals(y, None))(x)
-    A = J.T @ J
-    s = 1 / jnp.sqrt(jnp.where(jnp.diagonal(A) > 0, jnp.diagonal(A), 1))
-    inside = jnp.outer(s, s) * jnp.linalg.solve(A * jnp.outer(s, s), jnp.eye(5, dtype=dtype))
+    inside = _inverse(J.T @ J)
     T, R = pose(x)
     onto = tangent_basis(T / length)
     J_T = jax.jacfwd(lambda y: pose(y)[0])(x)
@@ -151,8 +132,47 @@ def refine(
     covariance = lift @ ((inside + inside.T) / 2) @ lift.T
     known = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(inside) > 0)
     enough = (jnp.sum(mask) >= FEWEST) | (prior is not None)
-    ok = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(x)) & known & enough
+    ok = successful & jnp.all(jnp.isfinite(x)) & known & enough
     return TwoView(T, R, covariance, rms, ok)
+
+
+def _root_of_information(
+    prior: Float[Array, "6 6"], basis: Float[Array, "3 2"], length: Float[Array, ""]
+) -> Float[Array, "5 5"]:
+    """What whitens the five unknowns: the inverse of a root of their covariance, that of the pose across T."""
+    lift = jax.scipy.linalg.block_diag(basis.T / length, jnp.eye(3, dtype=prior.dtype))
+    known = lift @ prior @ lift.T
+    s = jnp.sqrt(jnp.diagonal(known))
+    scaled = jnp.linalg.cholesky(known / jnp.outer(s, s))
+    return jax.scipy.linalg.solve_triangular(scaled, jnp.diag(1 / s), lower=True)
+
+
+def _huberised(d: Float[Array, " n"], huber: float) -> Float[Array, " n"]:
+    """Root of twice the Huber loss, so that least squares minimises it."""
+    large = jnp.abs(d) > huber
+    safe = jnp.where(large, jnp.abs(d), huber)
+    return jnp.where(large, jnp.sign(d) * jnp.sqrt(2 * huber * safe - huber**2), d)
+
+
+def _least_squares(
+    residuals: Callable[[Array, None], Array], first: Float[Array, " d"], max_steps: int
+) -> tuple[Float[Array, " d"], Bool[Array, ""]]:
+    """The minimum, with its derivatives, and whether it was reached."""
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+    solver = eqx.tree_at(lambda s: s.search, solver, _InOneDtype(solver.search))
+    solution = optx.least_squares(residuals, solver, first, max_steps=max_steps, throw=False)
+    # One Newton step from where it ended, which is not differentiated, has the derivatives of the minimum, and what
+    # the tolerance left open does not spread in differences of the result.
+    x = jax.lax.stop_gradient(solution.value)
+    slope = jax.grad(lambda y: jnp.sum(jnp.square(residuals(y, None))) / 2)
+    step = jnp.linalg.solve(jax.lax.stop_gradient(jax.jacfwd(slope)(x)), slope(x))
+    return x - jnp.where(jnp.all(jnp.isfinite(step)), step, 0), solution.result == optx.RESULTS.successful
+
+
+def _inverse(A: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """Of a normal matrix, scaled to a unit diagonal: its rows have different units."""
+    s = 1 / jnp.sqrt(jnp.where(jnp.diagonal(A) > 0, jnp.diagonal(A), 1))
+    return jnp.outer(s, s) * jnp.linalg.solve(A * jnp.outer(s, s), jnp.eye(len(A), dtype=A.dtype))
 
 
 def sensitivity(

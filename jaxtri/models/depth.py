@@ -10,6 +10,8 @@ considered (Schmidt 1966: one parameter is estimated, its variance is right) or 
 default; the measurement biases of Azarbayejani & Pentland 1995, section III).
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -168,42 +170,10 @@ class Depth(eqx.Module):
         def one(parameter: Array, ray: Array, C: Array, birth: SE3, z: Array) -> tuple[Array, Array, Array]:
             R1, T1 = birth.rotation().as_matrix(), birth.translation()
             A = R @ R1.T
-            b = T - A @ T1
             prior = jnp.concatenate([parameter[None], ray])
+            camera = partial(self._in_camera, A=A, b=T - A @ T1)
             C = C.at[0, 0].add(drift * jnp.square(parameter))
-
-            def camera(x: Array) -> Array:
-                turned = A @ homogeneous(x[1:])
-                return turned + x[0] * b if self.inverse else x[0] * turned + b
-
-            def moved(error: Array) -> Array:
-                # What a left perturbation of the pose does, to first order, to the point as it is believed.
-                X = camera(prior)
-                return dehomogenise(X + (parameter if self.inverse else 1.0) * error[:3] + jnp.cross(error[3:], X))
-
-            G = jax.jacfwd(moved)(jnp.zeros(6, z.dtype))
-            D = jnp.square(self.sigma) * jnp.eye(2, dtype=z.dtype) + G @ pose_covariance @ G.T
-
-            def linearise(x: Array) -> tuple[Array, Array, Array]:
-                """Innovation and Jacobian at x, and the inverse of the innovation's covariance."""
-                y, H = linearised(lambda x: dehomogenise(camera(x)), x)
-                return z - y - H @ (prior - x), H, _inverse_2x2(H @ C @ H.T + D)
-
-            def gain(H: Array, inverse: Array) -> Array:
-                K = C @ H.T @ inverse
-                return K if self.rays else K.at[1:].set(0.0)
-
-            r, H, inverse = linearise(prior)
-            inside = r @ inverse @ r <= self.gate
-            for _ in range(self.passes - 1):
-                r, H, inverse = linearise(prior + gain(H, inverse) @ r)
-            K = gain(H, inverse)
-            x = prior + K @ r
-            # Joseph's form: positive whatever the gain, a considered ray's included.
-            keep = jnp.eye(3, dtype=x.dtype) - K @ H
-            updated = keep @ C @ keep.T + K @ D @ K.T
-            good = inside & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(updated))
-            return x, updated, good
+            return self._update(camera, prior, C, self._noise(camera(prior), parameter, pose_covariance), z)
 
         x, C, good = jax.vmap(one)(bank.parameter, bank.ray, bank.covariance, bank.birth, observed)
         good &= mask
@@ -214,6 +184,53 @@ class Depth(eqx.Module):
             jnp.where(good[:, None, None], C, drifted),
             bank.birth,
         )
+
+    def _in_camera(self, x: Float[Array, "3"], *, A: Float[Array, "3 3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The point (parameter, ray), up to scale, in a camera of the pose (A, b) relative to that of its birth."""
+        turned = A @ homogeneous(x[1:])
+        return turned + x[0] * b if self.inverse else x[0] * turned + b
+
+    def _noise(
+        self, X: Float[Array, "3"], parameter: Float[Array, ""], pose_covariance: Float[Array, "6 6"]
+    ) -> Float[Array, "2 2"]:
+        """Covariance of an observation of the point believed to be at X in the camera, the pose's part in it."""
+
+        def moved(error: Array) -> Array:
+            # The left perturbation of the pose, to first order.
+            return dehomogenise(X + (parameter if self.inverse else 1.0) * error[:3] + jnp.cross(error[3:], X))
+
+        G = jax.jacfwd(moved)(jnp.zeros(6, X.dtype))
+        return jnp.square(self.sigma) * jnp.eye(2, dtype=X.dtype) + G @ pose_covariance @ G.T
+
+    def _update(
+        self,
+        camera: Callable[[Array], Array],
+        prior: Float[Array, "3"],
+        C: Float[Array, "3 3"],
+        D: Float[Array, "2 2"],
+        z: Float[Array, "2"],
+    ) -> tuple[Float[Array, "3"], Float[Array, "3 3"], Bool[Array, ""]]:
+        """One point's iterated update by its observation z of covariance D, and whether it may be taken."""
+
+        def linearise(x: Array) -> tuple[Array, Array, Array]:
+            """Innovation and Jacobian at x, and the inverse of the innovation's covariance."""
+            y, H = linearised(lambda x: dehomogenise(camera(x)), x)
+            return z - y - H @ (prior - x), H, _inverse_2x2(H @ C @ H.T + D)
+
+        def gain(H: Array, inverse: Array) -> Array:
+            K = C @ H.T @ inverse
+            return K if self.rays else K.at[1:].set(0.0)
+
+        r, H, inverse = linearise(prior)
+        inside = r @ inverse @ r <= self.gate
+        for _ in range(self.passes - 1):
+            r, H, inverse = linearise(prior + gain(H, inverse) @ r)
+        K = gain(H, inverse)
+        x = prior + K @ r
+        # Joseph's form: positive whatever the gain, a considered ray's included.
+        keep = jnp.eye(3, dtype=x.dtype) - K @ H
+        updated = keep @ C @ keep.T + K @ D @ K.T
+        return x, updated, inside & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(updated))
 
     def _homogeneous(self, x: Float[Array, "3"], R1: Float[Array, "3 3"], T1: Float[Array, "3"]) -> Float[Array, "4"]:
         """Homogeneous world point of (parameter, ray) in the camera (R1, T1). Source: Yu et al. 2006, eqs 15, 18."""

@@ -17,6 +17,11 @@ from jaxtri.trajectory import Trajectory
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
 SHADES = {"initialising": "#BBBBBB", "coasting": "#F0E442", "restarted": "#CC79A7", "lost": "#666666"}
 MARKERS = ("^", "o", "s")
+NAMES = ("x (right)", "y (down)", "z (ahead)")
+GAP = 3.5  # median steps from which a line is broken: more than two frames are missing, however uneven the clock
+RUN = 1.5  # median steps that may lie between two frames of one shaded span
+BULK = (4, 96)  # percentiles of the points that must be in the picture
+ROOM = 0.2  # of their extent, about them
 
 
 def yaw_pitch_roll(
@@ -57,33 +62,16 @@ def plot_trajectory(
     above, side, move, turn = figure.subplots(2, 2).ravel()
     p = trajectory.positions
     seconds = trajectory.times - trajectory.times[0]
-    # From the side that shows more of the path.
-    k = 0 if np.ptp(p[:, 0]) > np.ptp(p[:, 2]) else 2
-    for axes, (i, j), labels, name in (
-        (above, (0, 2), ("x (right)", "z (ahead)"), "path from above"),
-        (side, (k, 1), ("x (right)" if k == 0 else "z (ahead)", "y (down)"), "path from the side"),
-    ):
-        if points is not None and len(points):
-            _cloud(axes, points[:, [i, j]], p[:, [i, j]])
-        if reference is not None:
-            axes.plot(*_broken(reference.times, reference.positions[:, [i, j]]).T, "k--", lw=1, label="truth")
-        axes.plot(*_broken(seconds, p[:, [i, j]]).T, color=COLOURS[0], lw=1.8, label="estimate")
-        axes.plot(*p[0, [i, j]], "o", color=COLOURS[2], label="start")
-        axes.set(xlabel=f"{labels[0]} [{units}]", ylabel=f"{labels[1]} [{units}]", title=name)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.legend(loc="best", fontsize=8)
+    k = 0 if np.ptp(p[:, 0]) > np.ptp(p[:, 2]) else 2  # from the side that shows more of the path
+    for axes, plane, name in ((above, (0, 2), "path from above"), (side, (k, 1), "path from the side")):
+        _path(axes, plane, trajectory, reference, points)
+        across, up = (f"{NAMES[i]} [{units}]" for i in plane)
+        axes.set(xlabel=across, ylabel=up, title=name)
     side.invert_yaxis()
 
-    angles = yaw_pitch_roll(trajectory.rotations)
-    sd_p = sd_r = None
-    if trajectory.covariance is not None:
-        C = trajectory.covariance
-        sd_p = np.sqrt(np.maximum(np.diagonal(C[:, :3, :3], axis1=1, axis2=2), 0))
-        R = trajectory.rotations
-        variance = np.asarray(_angle_variance(jnp.asarray(R[0].T @ R), jnp.asarray(C[:, 3:, 3:])), np.float64)
-        sd_r = np.rad2deg(np.sqrt(np.maximum(variance, 0)))
+    sd_p, sd_r = _deviations(trajectory)
     _curves(move, seconds, p - p[0], sd_p, ("$t_x$", "$t_y$", "$t_z$"))
-    _curves(turn, seconds, angles, sd_r, ("yaw", "pitch", "roll"))
+    _curves(turn, seconds, yaw_pitch_roll(trajectory.rotations), sd_r, ("yaw", "pitch", "roll"))
     if reference is not None:
         times = reference.times - trajectory.times[0]
         truths = (reference.positions - p[0], yaw_pitch_roll(reference.rotations, trajectory.rotations[0]))
@@ -104,10 +92,39 @@ def plot_trajectory(
     return figure
 
 
+def _path(
+    axes: Axes,
+    plane: tuple[int, int],
+    trajectory: Trajectory,
+    reference: Trajectory | None,
+    points: np.ndarray | None,
+) -> None:
+    """The path, the truth and the points, seen along the axis that `plane` leaves out."""
+    p = trajectory.positions[:, plane]
+    if points is not None and len(points):
+        _cloud(axes, points[:, plane])
+    if reference is not None:
+        axes.plot(*_broken(reference.times, reference.positions[:, plane]).T, "k--", lw=1, label="truth")
+    axes.plot(*_broken(trajectory.times, p).T, color=COLOURS[0], lw=1.8, label="estimate")
+    axes.plot(*p[0], "o", color=COLOURS[2], label="start")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(loc="best", fontsize=8)
+
+
+def _deviations(trajectory: Trajectory) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Standard deviations (t, 3) of the positions, and of yaw, pitch and roll in degrees; None where unknown."""
+    C, R = trajectory.covariance, trajectory.rotations
+    if C is None:
+        return None, None
+    positions = np.sqrt(np.maximum(np.diagonal(C[:, :3, :3], axis1=1, axis2=2), 0))
+    variance = np.asarray(_angle_variance(jnp.asarray(R[0].T @ R), jnp.asarray(C[:, 3:, 3:])), np.float64)
+    return positions, np.rad2deg(np.sqrt(np.maximum(variance, 0)))
+
+
 def _broken(times: np.ndarray, values: np.ndarray) -> np.ndarray:
     """The values with a NaN put into every gap of more than two frames: matplotlib breaks its lines there."""
     steps = np.diff(times)
-    gaps = np.flatnonzero(steps > 3.5 * np.median(steps)) + 1 if len(steps) else []
+    gaps = np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else []
     return np.insert(np.asarray(values, np.float64), gaps, np.nan, axis=0)
 
 
@@ -124,7 +141,7 @@ def _curves(axes: Axes, seconds: np.ndarray, values: np.ndarray, sd: np.ndarray 
 def _shade(axes: Axes, seconds: np.ndarray, status: np.ndarray, names: Mapping[int, str]) -> None:
     half = np.median(np.diff(seconds)) / 2 if len(seconds) > 1 else 0.5
     # A span for each run of one status without a gap.
-    breaks = (np.diff(status) != 0) | (np.diff(seconds) > 3 * half)
+    breaks = (np.diff(status) != 0) | (np.diff(seconds) > RUN * 2 * half)
     shown = set()
     for run in np.split(np.arange(len(seconds)), np.flatnonzero(breaks) + 1):
         name = names.get(int(status[run[0]]), "")
@@ -135,9 +152,9 @@ def _shade(axes: Axes, seconds: np.ndarray, status: np.ndarray, names: Mapping[i
             axes.axvspan(first, last, color=SHADES[name], alpha=0.4, lw=0, label=label)
 
 
-def _cloud(axes, points, path) -> None:
+def _cloud(axes: Axes, points: np.ndarray) -> None:
     """The points, but those far from the bulk: one wild depth must not shrink the path to a dot."""
-    low, high = np.percentile(points, [4, 96], axis=0)
-    margin = 0.2 * (high - low) + 1e-9
+    low, high = np.percentile(points, BULK, axis=0)
+    margin = ROOM * (high - low) + 1e-9
     good = ((points > low - margin) & (points < high + margin)).all(axis=1)
     axes.plot(*points[good].T, ".", color="#999999", ms=1.5, alpha=0.5, label="points", zorder=0)
