@@ -1,26 +1,13 @@
-"""Three views: the trifocal tensor, and the transfer of a point of two views to the third.
+"""Three views: the transfer of a point of two views to the third.
 
-Two forms of the same transfer stand here: by the tensor, as the paper writes it, and by matrices. They are
-equal up to a factor, and the tests prove it; the filters use the second.
+By matrices, which is equal up to a factor to the transfer by the trifocal tensor, as the paper writes it: the tests
+have both.
 """
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtri.geometry.epipolar import dehomogenise, homogeneous, inverse_depth
-
-
-def tensor(P2: Float[Array, "3 4"], P3: Float[Array, "3 4"]) -> Float[Array, "3 3 3"]:
-    """Trifocal tensor T[i, j, k] of the cameras [I | 0], P2 and P3: a^j_i b^k_4 - a^j_4 b^k_i.
-
-    Source: Yu et al. 2006, eq. 8; Hartley & Zisserman 2004, eq. 15.1.
-    """
-    return jnp.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]) - jnp.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
-
-
-def transfer_by_tensor(T: Float[Array, "3 3 3"], u1: Float[Array, "2"], line2: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Homogeneous point of view 3: u''^k = u^i l'_j T_i^jk. Source: Yu et al. 2006, eq. 7."""
-    return jnp.einsum("i,j,ijk->k", homogeneous(u1), line2, T)
 
 
 def transfer(
