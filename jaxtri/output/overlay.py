@@ -11,6 +11,20 @@ from jaxtyping import Bool, Float, Int, UInt8
 from jaxtri.errors import InputError
 from jaxtri.geometry.camera import Camera
 
+PIECES = 8  # of an edge where the lens bends it
+BEYOND = 1.1  # of the border of the image: what lies just outside is drawn whole
+NEAR = 0.02  # of the object's own distance, below which a point is behind the lens; a share, so units do not matter
+
+DRAWS = 600  # of three points: even where a sixth of them lie on the plane, all draws miss it in 6 % of the scenes
+BEHIND, PENALTY = 2.0, 3.0  # limits behind a plane from which a point counts against it, and how many on it it undoes
+FACING, UPRIGHT = 3.0, 0.8  # how much more a plane counts whose normal is within 37 degrees of upwards
+FIT_POINTS = 5  # among those of the plane nearest to the aim: their mean is where the object stands
+GROUND = 0.5  # cosine to upwards from which a plane is one to stand on, not to hang on
+LOWER = 0.75  # of the height of the image: well in front of what stands on a table
+SLANTED = 1e-6  # cosine below which a ray runs along the plane
+HEADING = np.deg2rad(25)  # from the image's x axis: what is seen from the side alone looks flat
+CLIP = 3.0  # normalised: beyond, a lens model may fold back into the image
+
 _to_pixels = jax.jit(Camera.to_pixels)
 _to_normalised = jax.jit(Camera.to_normalised)
 
@@ -81,7 +95,7 @@ def draw_wireframe(
     T = T_camera_world @ T_world_object
     X = wireframe.vertices @ T[:3, :3].T + T[:3, 3]
     a, b, seen = _clip(X[wireframe.edges[:, 0]], X[wireframe.edges[:, 1]], _view_limits(camera, image.shape))
-    pieces = np.linspace(0, 1, 9 if camera.distortion is not None else 2)[:, None]
+    pieces = np.linspace(0, 1, PIECES + 1 if camera.distortion is not None else 2)[:, None]
     line = a[:, None] + pieces * (b - a)[:, None]
     # All edges are projected, seen or not: another number of them would compile again.
     xy = line[..., :2] / np.where(seen[:, None, None], line[..., 2:], np.inf)
@@ -97,13 +111,12 @@ def _view_limits(camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
     """Largest |x| and |y| in view, normalised, with a margin: beyond, a lens model may fold back into the image."""
     v, u = np.meshgrid([0, shape[0] / 2, shape[0]], [0, shape[1] / 2, shape[1]])
     border = _to_normalised(camera, jnp.asarray(np.stack([u, v], -1), camera.fx.dtype))
-    return 1.1 * np.abs(np.asarray(border, np.float64)).max(axis=(0, 1))
+    return BEYOND * np.abs(np.asarray(border, np.float64)).max(axis=(0, 1))
 
 
 def _clip(a: np.ndarray, b: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The parts of segments between points (e, 3) that are in view (|x| and |y| < limit z, z > near), and which are."""
-    # Whatever is this near is behind the lens: a share of the object's own distance, so that units do not matter.
-    near = 0.02 * max(float(np.median(np.linalg.norm(a, axis=1))), 1e-9)
+    near = NEAR * max(float(np.median(np.linalg.norm(a, axis=1))), 1e-9)
     seen = np.ones(len(a), bool)
     x, y = limits
     for normal, least in (((0, 0, 1), near), ((1, 0, x), 0), ((-1, 0, x), 0), ((0, 1, y), 0), ((0, -1, y), 0)):
@@ -112,17 +125,6 @@ def _clip(a: np.ndarray, b: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray,
         step = (b - a) / np.where(da == db, 1, da - db)
         a, b = a + np.minimum(da, 0) * step, b + np.minimum(db, 0) * step
     return a, b, seen
-
-
-def draw_tracks(
-    image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"], used: Bool[np.ndarray, " n"]
-) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with its features: green where the filter used them, grey where it did not."""
-    out = image.copy()
-    for (x, y), good in zip(pixels, used, strict=True):
-        colour = (80, 220, 80) if good else (150, 150, 150)
-        cv2.circle(out, (round(float(x)), round(float(y))), 2, colour, -1, cv2.LINE_AA)
-    return out
 
 
 def draw_text(image: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -154,7 +156,7 @@ def dominant_plane(
     rng = np.random.default_rng(seed)
     limit = share * np.linalg.norm(points - camera_centre, axis=1)
     best, most = None, -np.inf
-    for _ in range(600):
+    for _ in range(DRAWS):
         a, b, c = points[rng.choice(len(points), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(normal)
@@ -162,8 +164,8 @@ def dominant_plane(
             continue
         normal *= np.sign(normal @ (camera_centre - a) or 1.0) / length
         height = (points - a) @ normal
-        score = (np.abs(height) < limit).sum() - 3.0 * (height < -2 * limit).sum()
-        score *= 3.0 if score > 0 and up is not None and normal @ up > 0.8 else 1.0
+        score = (np.abs(height) < limit).sum() - PENALTY * (height < -BEHIND * limit).sum()
+        score *= FACING if score > 0 and up is not None and normal @ up > UPRIGHT else 1.0
         if score > most:
             best, most = np.abs(height) < limit, score
     if best is None:
@@ -193,30 +195,29 @@ def place(
     seen = (points - centre) @ R
     ahead = seen[:, 2] > 0
     xy = seen[:, :2] / np.where(ahead, seen[:, 2], 1)[:, None]
-    pixels = np.asarray(_to_pixels(camera, jnp.asarray(np.clip(xy, -3, 3))))
+    pixels = np.asarray(_to_pixels(camera, jnp.asarray(np.clip(xy, -CLIP, CLIP))))
     w, h = float(camera.width or 2 * camera.cx), float(camera.height or 2 * camera.cy)
     visible = ahead & (pixels > 0).all(axis=1) & (pixels < [w, h]).all(axis=1)
     plane = dominant_plane(points[visible], centre, up=-R[:, 1])
     if pixel is None:
         on = pixels[visible][plane.inliers]
         # In the middle of a wall or of the ground from above, but well in front of what stands on a table.
-        aim = np.array([0.5 * w, (0.75 if plane.normal @ -R[:, 1] > 0.5 else 0.5) * h])
-        target = on[np.argsort(np.linalg.norm(on - aim, axis=1))[:5]].mean(axis=0)
+        aim = np.array([0.5 * w, (LOWER if plane.normal @ -R[:, 1] > GROUND else 0.5) * h])
+        target = on[np.argsort(np.linalg.norm(on - aim, axis=1))[:FIT_POINTS]].mean(axis=0)
     else:
         target = np.array(pixel, float)
         if not ((target >= 0) & (target < [w, h])).all():
             raise InputError(f"--place {pixel[0]:g} {pixel[1]:g} lies outside the image of {w:g}x{h:g} pixels")
     ray = R @ np.append(np.asarray(camera.to_normalised(jnp.asarray(target))), 1.0)
     slope = ray @ plane.normal
-    distance = (plane.point - centre) @ plane.normal / slope if abs(slope) > 1e-6 else -1.0
+    distance = (plane.point - centre) @ plane.normal / slope if abs(slope) > SLANTED else -1.0
     if distance <= 0:
         raise InputError("the dominant plane is not met at that pixel: choose another by --place")
     spot = centre + distance * ray
     # It heads along the image's x axis, as far as that lies in the plane.
     x = R[:, 0] - (R[:, 0] @ plane.normal) * plane.normal
     x /= np.linalg.norm(x)
-    turn = np.deg2rad(25)
-    x = np.cos(turn) * x + np.sin(turn) * np.cross(plane.normal, x)
+    x = np.cos(HEADING) * x + np.sin(HEADING) * np.cross(plane.normal, x)
     scale = size * w / float(camera.fx) * distance
     T = np.eye(4)
     T[:3, :3] = scale * np.stack([x, np.cross(plane.normal, x), plane.normal], axis=1)

@@ -6,7 +6,7 @@ from jaxlie import SO3
 
 from jaxtri.errors import InputError
 from jaxtri.geometry.camera import BrownConrady, Camera
-from jaxtri.output.overlay import Wireframe, car, dominant_plane, draw_text, draw_tracks, draw_wireframe, place
+from jaxtri.output.overlay import Wireframe, car, dominant_plane, draw_text, draw_wireframe, place
 
 SIZE = {"width": 320, "height": 240}
 PINHOLE = Camera.from_parameters(250, 260, 158, 121, **SIZE)
@@ -136,11 +136,7 @@ def test_the_car_stands_on_the_plane_at_the_pixel(wall):
         place(points, T_world_camera, PINHOLE, pixel=(500.0, 10.0))
 
 
-def test_features_and_text_are_marked_on_a_copy():
+def test_text_is_written_on_a_copy():
     image = np.full((240, 320, 3), 90, np.uint8)
-    marked = draw_tracks(image, np.array([[20.2, 30.0], [200.0, 100.0]]), np.array([True, False]))
-    green, gray = marked[30, 20].astype(int), marked[100, 200].astype(int)
-    assert green[1] - green[0] > 100
-    assert np.ptp(gray) == 0
     assert (draw_text(image, "frame 7")[200:] != 90).any()
     assert (image == 90).all()
