@@ -6,7 +6,7 @@ arrays. Values are looked at where there are any: under `jit`, `grad` and `vmap`
 
 import inspect
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, get_args
 
@@ -15,9 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
-from jaxtyping import AbstractArray
+from jaxtyping import AbstractArray, ArrayLike
 
 from jaxtri.errors import InputError, UnitsWarning
+
+Given = ArrayLike | Sequence[Any]
+"""What a door takes for an array on the host: NumPy's, JAX's, or lists."""
 
 P = ParamSpec("P")
 R = TypeVar("R")

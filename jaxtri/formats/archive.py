@@ -1,8 +1,9 @@
 """Beliefs, recordings, runs and whole odometries in one file, to go on from or to look into.
 
 The file is a NumPy archive (`.npz`): `numpy.load` reads it anywhere. Each array stands under the path by which it is
-reached, as `poses/0/covariance`. The entry `tree` holds what is not an array, as JSON in UTF-8 bytes: `format` (1),
-`versions`, and `root`, a node. A node is a JSON null, boolean, number or string as it is, or an object of one key:
+reached, as `poses/0/covariance`, with a `~` where that is taken. The entry `tree` holds what is not an array, as JSON
+in UTF-8 bytes: `format` (1), `versions`, and `root`, a node. A node is a JSON null, boolean, number or string as it is,
+or an object of one key:
 `float` ("nan", "inf", "-inf"), `array` (its path; `jax` beside it where JAX held it), `list`, `tuple`, `dict` (pairs
 of key and node), `enum` (class and value), or `class` with `fields`, for dataclasses, Equinox modules, JAX
 dataclasses and named tuples. A class is written as `module:name`; nothing in the file is ever run as code.
@@ -26,6 +27,7 @@ from jaxtri.errors import InputError
 from jaxtri.formats.files import PathLike, atomic_write
 
 FORMAT = 1
+TREE = "tree"
 _PACKAGES = ("jaxtri", "jaxlie")  # whose classes are known by name; others have to be given
 
 T = TypeVar("T", bound="Archived")
@@ -51,13 +53,13 @@ def save(path: PathLike, thing: Any) -> None:
     """Write a belief, model, recording, run, odometry, or any tree of such, as a whole or not at all.
 
     Whatever is made of arrays, numbers, strings, lists, tuples, dictionaries, enumerations, dataclasses and named
-    tuples can be written; see the head of this module for the file. Raises `InputError` that names what cannot.
+    tuples can be written; `jaxtri.formats.archive` describes the file. Raises `InputError` that names what cannot.
     """
     arrays: dict[str, np.ndarray] = {}
     root = _node(thing, "", arrays)
     versions = {name: importlib.metadata.version(name) for name in ("jaxtri", "jax")}
     tree = json.dumps({"format": FORMAT, "versions": versions, "root": root}, allow_nan=False)
-    arrays["tree"] = np.frombuffer(tree.encode(), np.uint8)
+    arrays[TREE] = np.frombuffer(tree.encode(), np.uint8)
     # Not `numpy.savez`, whose keyword arguments are the names.
     with atomic_write(path, "wb") as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
@@ -74,7 +76,7 @@ def load(path: PathLike, *, types: Sequence[type] = ()) -> Any:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        tree = json.loads(arrays.pop("tree").tobytes())
+        tree = json.loads(arrays.pop(TREE).tobytes())
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read as an archive of jaxtri.save: {error}") from error
     if tree.get("format") != FORMAT:
@@ -99,6 +101,8 @@ def _node(x: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return x if math.isfinite(x) else {"float": str(x)}
     if isinstance(x, jax.Array | np.ndarray | np.generic):
         name = path or "value"
+        while name in arrays or name == TREE:  # as where a key has a slash in it
+            name += "~"
         arrays[name] = np.asarray(x)
         return {"array": name, "jax": True} if isinstance(x, jax.Array) else {"array": name}
     if dataclasses.is_dataclass(x) and not isinstance(x, type):

@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
-from jaxtyping import ArrayLike
 
-from jaxtri.checks import booleans, image_noise, numbers, pixel_points
+from jaxtri.checks import Given, booleans, image_noise, numbers, pixel_points
 from jaxtri.compilation import capacity
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.estimation.two_view import scaled
@@ -130,12 +129,12 @@ class Odometry(Archived):
 
     def add(
         self,
-        pixels: ArrayLike,
-        visible: ArrayLike,
+        pixels: Given,
+        visible: Given,
         time: float,
         *,
-        ids: ArrayLike | None = None,
-        quality: ArrayLike | None = None,
+        ids: Given | None = None,
+        quality: Given | None = None,
     ) -> np.ndarray:
         """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
 
@@ -225,11 +224,11 @@ class Odometry(Archived):
     def _observe(
         self,
         index: int,
-        pixels: ArrayLike,
-        visible: ArrayLike,
+        pixels: Given,
+        visible: Given,
         time: float,
-        ids: ArrayLike | None,
-        quality: ArrayLike | None,
+        ids: Given | None,
+        quality: Given | None,
     ) -> tuple[Observations, Slotted, np.ndarray]:
         """The frame as the filters take it, its tracks in slots, and the number of each row."""
         z = numbers("pixels", pixels, ("n", 2))

@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
-from jaxtyping import ArrayLike
 from tqdm import tqdm
 
-from jaxtri.checks import booleans, numbers
+from jaxtri.checks import Given, booleans, numbers
 from jaxtri.compilation import capacity
 from jaxtri.errors import CameraError, InputError
 from jaxtri.formats.archive import Archived
@@ -194,9 +193,9 @@ def warm_up(
 
 def follow_tracks(
     camera: Camera,
-    pixels: ArrayLike,
-    visible: ArrayLike,
-    times: ArrayLike | None = None,
+    pixels: Given,
+    visible: Given,
+    times: Given | None = None,
     *,
     base: Base | str = Base.TRACKS,
     settings: Settings | None = None,
