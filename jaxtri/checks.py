@@ -19,7 +19,7 @@ from jaxtyping import AbstractArray, ArrayLike
 
 from jaxtri.errors import InputError, UnitsWarning
 
-Given = ArrayLike | Sequence[Any]
+ArrayOrList = ArrayLike | Sequence[Any]
 """What a door takes for an array on the host: NumPy's, JAX's, or lists."""
 
 P = ParamSpec("P")

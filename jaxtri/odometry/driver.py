@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
 
-from jaxtri.checks import Given, booleans, image_noise, numbers, pixel_points
+from jaxtri.checks import ArrayOrList, booleans, image_noise, numbers, pixel_points
 from jaxtri.compilation import capacity
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.estimation.two_view import scaled
@@ -129,12 +129,12 @@ class Odometry(Archived):
 
     def add(
         self,
-        pixels: Given,
-        visible: Given,
+        pixels: ArrayOrList,
+        visible: ArrayOrList,
         time: float,
         *,
-        ids: Given | None = None,
-        quality: Given | None = None,
+        ids: ArrayOrList | None = None,
+        quality: ArrayOrList | None = None,
     ) -> np.ndarray:
         """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
 
@@ -224,11 +224,11 @@ class Odometry(Archived):
     def _observe(
         self,
         index: int,
-        pixels: Given,
-        visible: Given,
+        pixels: ArrayOrList,
+        visible: ArrayOrList,
         time: float,
-        ids: Given | None,
-        quality: Given | None,
+        ids: ArrayOrList | None,
+        quality: ArrayOrList | None,
     ) -> tuple[Observations, Slotted, np.ndarray]:
         """The frame as the filters take it, its tracks in slots, and the number of each row."""
         z = numbers("pixels", pixels, ("n", 2))

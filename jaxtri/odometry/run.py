@@ -12,7 +12,7 @@ from itertools import islice
 import numpy as np
 from tqdm import tqdm
 
-from jaxtri.checks import Given, booleans, numbers
+from jaxtri.checks import ArrayOrList, booleans, numbers
 from jaxtri.compilation import capacity
 from jaxtri.errors import CameraError, InputError
 from jaxtri.formats.archive import Archived
@@ -193,19 +193,20 @@ def warm_up(
 
 def follow_tracks(
     camera: Camera,
-    pixels: Given,
-    visible: Given,
-    times: Given | None = None,
+    pixels: ArrayOrList,
+    visible: ArrayOrList,
+    times: ArrayOrList | None = None,
     *,
     base: Base | str = Base.TRACKS,
     settings: Settings | None = None,
     start: StartSettings | None = None,
     record: bool = False,
 ) -> Odometry:
-    """The same from feature tracks: `pixels` (t, n, 2) and `visible` (t, n), a column a track.
+    """Recover the camera's trajectory from feature tracks: `pixels` (t, n, 2) and `visible` (t, n), a column a track.
 
-    NaN where a track is not seen is as good as False. `times` (t,) in seconds, by default the frame number. The
-    columns are filled up to one of a few numbers, so that another number of tracks compiles nothing.
+    A pixel that is NaN counts as not visible. `times` (t,) are in seconds, by default the numbers of the frames. The
+    columns are filled up to 64, 128, 256, ..., so that another number of tracks compiles nothing.
+
     Raises `InputError` where a shape does not fit or there are fewer than two frames.
     """
     z = numbers("pixels", pixels, ("t", "n", 2))
