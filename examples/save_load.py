@@ -1,4 +1,4 @@
-"""Keep a run in a file and go on from it later, as if it had never stopped; the same with a filter's belief."""
+"""Half of the frames today and half tomorrow: an odometry kept in a file goes on as if it had never stopped."""
 
 import tempfile
 from pathlib import Path
@@ -7,32 +7,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtri import Belief, Camera, Kinematics, Odometry, load, save
+from jaxtri import Belief, Camera, Odometry, load, save
+from jaxtri.synthetic import steady_experiment
 
 jax.config.update("jax_enable_x64", True)
 
-# Points before a camera that slides to the right, 3 cm a frame; tracks with a noise of 0.3 pixels.
-rng, frames = np.random.default_rng(0), 30
-points = rng.uniform([-2, -1.5, 3], [2, 1.5, 5], (80, 3))
-X = points - np.arange(frames)[:, None, None] * [0.03, 0.0, 0.0]
-pixels = 500 * X[..., :2] / X[..., 2:] + [320, 240] + rng.normal(scale=0.3, size=(frames, 80, 2))
-visible = ((pixels > 0) & (pixels < [640, 480])).all(axis=2)
-camera = Camera.from_parameters(500, 500, 320, 240, width=640, height=480)
+folder = Path(tempfile.mkdtemp())
+truth = steady_experiment(jax.random.key(0), orbit=True, degrees_per_frame=(0.3, 1.0, 0.0), n_points=60, n_frames=30)
+camera = Camera.from_parameters(600, 600, 320, 240, width=640, height=480)
+frames = camera.to_pixels(truth.observed)
 
 
-def feed(odometry, those):
-    for k in those:
-        odometry.add(pixels[k], visible[k], time=k / 25)
+def follow(odometry, first, last):
+    for k in range(first, last):
+        odometry.add(frames[k], np.ones(60, bool), k / 25)
     return odometry
 
 
-folder = Path(tempfile.mkdtemp())
-feed(Odometry(camera), range(15)).save(folder / "half.npz")
-resumed = feed(Odometry.load(folder / "half.npz"), range(15, frames)).trajectory()
-whole = feed(Odometry(camera), range(frames)).trajectory()
-apart = np.abs(resumed.T_world_camera - whole.T_world_camera).max()
-print(f"{len(resumed)} poses, saved after 15 and gone on with: {apart} apart from those of a run without a stop")
+follow(Odometry(camera), 0, 15).save(folder / "odometry.npz")
+resumed = follow(Odometry.load(folder / "odometry.npz"), 15, 30)
+at_once = follow(Odometry(camera), 0, 30)
+same = np.array_equal(resumed.trajectory().T_world_camera, at_once.trajectory().T_world_camera)
+print(f"{len(resumed.poses)} poses, {resumed.status.name.lower()}; the same as without a stop: {same}")
 
-still = Kinematics(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
-save(folder / "belief.npz", Belief(still, jnp.eye(12)))
-print("arrays in belief.npz:", sorted(np.load(folder / "belief.npz")), "->", type(load(folder / "belief.npz").mean))
+# Beliefs, models, settings, recordings, and lists and dictionaries of such, are kept the same way.
+save(folder / "belief.npz", {"frame": 15, "belief": Belief(jnp.zeros(3), jnp.eye(3))})
+kept = load(folder / "belief.npz")
+print(f"frame {kept['frame']}: {kept['belief'].mean} with deviations {jnp.sqrt(jnp.diag(kept['belief'].covariance))}")
