@@ -174,7 +174,7 @@ def _kinds(hint: Any) -> list[type[AbstractArray]]:
 
 
 def _leaves(tree: M, dtype: Any) -> M:
-    """NumPy arrays and Python floats become JAX arrays."""
+    """NumPy arrays and Python floats become JAX arrays, and all floats of one dtype."""
 
     if isinstance(tree, float):  # by itself: `dt`, say
         return tree
@@ -184,6 +184,8 @@ def _leaves(tree: M, dtype: Any) -> M:
             return jnp.asarray(x, dtype)
         if isinstance(x, np.ndarray | np.generic):
             return jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.inexact) else None)
+        if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != dtype:
+            return x.astype(dtype)
         return x
 
     return jax.tree.map(leaf, tree)

@@ -156,7 +156,7 @@ def test_values_are_not_looked_at_where_there_are_none():
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_the_belief_says_how_precise_a_run_is(dtype):
     belief = jax.tree.map(lambda x: x.astype(dtype), PRIOR)
-    found = run(Ramp(jnp.asarray(0.1, dtype)), belief, np.asarray(ITEMS), np.asarray(OBSERVED), np.asarray(MASK))
+    found = run(Ramp(jnp.asarray(0.1)), belief, np.asarray(ITEMS), np.asarray(OBSERVED), np.asarray(MASK))
     assert found.mean.dtype == found.covariance.dtype == dtype
 
 
@@ -197,6 +197,8 @@ def test_noises_and_focal_lengths_are_positive(value):
 
 
 def test_settings_want_a_pass():
+    with pytest.raises(InputError, match="passes is 0"):
+        Robust(passes=0)
     with pytest.raises(InputError, match="passes is 0"):
         Settings.of(CAMERA, passes=0)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxtri.checks import number
+from jaxtri.errors import InputError
 
 Taken = TypeVar("Taken", bound=PyTree)
 
@@ -34,6 +35,11 @@ class Robust(eqx.Module):
     scale: Float[Array, ""] = eqx.field(default=16.0, converter=number)
     gate: Float[Array, ""] = eqx.field(default=13.8, converter=number)
     passes: int = eqx.field(static=True, default=9)
+
+    def __check_init__(self) -> None:
+        """Raise `InputError` where there is no pass."""
+        if self.passes < 1:
+            raise InputError(f"passes is {self.passes}; give at least 1")
 
     def weights(self, distance: Float[Array, " n"], k: Int[Array, ""], passes: int) -> Float[Array, " n"]:
         """Weights in pass k of `passes`, of items whose squared Mahalanobis distance is given."""

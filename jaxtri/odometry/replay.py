@@ -7,6 +7,7 @@ derivatives are those of the implicit function theorem.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -82,6 +83,8 @@ class Recording(eqx.Module, Archived):
         return refine(T, R, u[self.first[0]], u[self.second[0]], self.inside[0], settings.sigma)
 
 
+# Compiled as a whole: operation by operation its gradient would take many minutes to compile.
+@partial(jax.jit, static_argnames="block")
 def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: int = 1) -> Report:
     """The run of `jaxtri.track_pairs`, a base pair per track: reports of all frames after the first, (t - 1,)."""
     u = recording.normalised(camera)
@@ -102,6 +105,7 @@ def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: i
     return track_pairs.filter(settings, state, *frames, hold=hold[:, 0], quality=recording.quality[1:], block=block)[1]
 
 
+@partial(jax.jit, static_argnames="block")
 def pairs(camera: Camera, settings: Settings, recording: Recording, *, block: int = 1) -> Report:
     """The run of `jaxtri.single_pair`, one base pair for all tracks: reports (s, l) of the frames of each segment.
 

@@ -1,11 +1,11 @@
 import dataclasses
-import types
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxlie import SE3
 from tracks import sideways
 
 from jaxtri.errors import InitialisationError, InputError
@@ -16,7 +16,7 @@ from jaxtri.models.point_noise import PointNoise
 from jaxtri.odometry import replay
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.run import follow_tracks
-from jaxtri.odometry.settings import Base, Settings, StartSettings
+from jaxtri.odometry.settings import Base, Report, Settings, StartSettings
 
 TRACKS = sideways(16, seed=1)
 SETTINGS = Settings.of(TRACKS.camera, noise_px=0.3)
@@ -115,7 +115,9 @@ def test_likelihoods_are_those_of_pixels():
     said = jax.vmap(Diagnostics)(
         jnp.asarray([30.0, 40.0]), jnp.zeros(2), jnp.asarray([4, 5]), jnp.asarray([3, 5]), weights, weights
     )
-    report = types.SimpleNamespace(diagnostics=said)
+    pose = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, *x.shape)), SE3.identity())
+    none = jnp.zeros(2, bool)
+    report = Report(pose, jnp.zeros((2, 6, 6)), jnp.ones(2, int), none, jnp.zeros((2, 5), bool), said)
     jacobians = jax.vmap(jax.vmap(jax.jacrev(camera.to_normalised)))(pixels[1:])
     log_det = np.log(np.abs(np.linalg.det(jacobians)))[np.asarray(weights) > 0].sum()
     expected = -(70 + log_det - np.log(640 * 480)) / 18
