@@ -522,3 +522,117 @@ def test_float32_stays_float32_and_positive_over_a_long_run():
     nees = np.einsum("ti,tij,tj->t", errors, np.linalg.inv(P), errors)
     low, high = nees_interval(6, nees.size / 3)  # as in `test_smoothing_a_rotating_camera`
     assert low < nees.mean() < high
+
+
+def wrapped(angle):
+    """An angle from -pi to pi."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+class RawBearing(Linear):
+    """Position and velocity in the plane; an item is where a bearing, and a distance with it, are measured from."""
+
+    sigma: Float[Array, "2"]  # of distance and bearing
+
+    def measure(self, mean, item):
+        x, y = mean[:2] - item
+        return jnp.stack([jnp.hypot(x, y), jnp.arctan2(y, x)])
+
+    def noise(self, mean, item):
+        return jnp.diag(self.sigma**2)
+
+
+class Bearing(RawBearing):
+    def residual(self, observed, predicted):
+        error = observed - predicted
+        return error.at[1].set(wrapped(error[1]))
+
+
+def around(frames=40):
+    """A model of each kind, a belief, where is measured from, and what is seen of a target that goes around it once."""
+    angle = np.linspace(0, 2 * np.pi, frames)
+    truth = 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    items = np.array([[0.0, 0.0], [0.3, -0.2], [-0.4, 0.1]])
+    seen = truth[:, None] - items
+    observed = np.stack([np.hypot(*seen.T).T, np.arctan2(*seen.T[::-1]).T], axis=-1)
+    sigma = np.array([0.05, 0.03])
+    observed = observed + sigma * np.random.default_rng(0).normal(size=observed.shape)
+    observed[..., 1] = wrapped(observed[..., 1])
+    F, Q = np.eye(4, k=2), np.diag([0.01, 0.01, 0.05, 0.05]) ** 2
+    models = [kind(jnp.asarray(F), jnp.asarray(Q), jnp.asarray(sigma)) for kind in (Bearing, RawBearing)]
+    belief = ekf.Belief(jnp.asarray([*truth[0], 0.0, 0.3]), jnp.eye(4) * 0.1)
+    return models, belief, jnp.asarray(items), jnp.asarray(observed), truth
+
+
+def bearing_update(belief, items, observed, sigma, passes):
+    """The textbook's iterated filter, item below item, numerical Jacobians of residuals that are wrapped by hand."""
+    prior, P = np.asarray(belief.mean), np.asarray(belief.covariance)
+
+    def residual(x):
+        seen = x[:2] - items
+        error = observed - np.stack([np.hypot(*seen.T), np.arctan2(*seen.T[::-1])], axis=-1)
+        return np.stack([error[:, 0], wrapped(error[:, 1])], axis=-1).ravel()
+
+    x, R = prior, np.diag(np.tile(sigma**2, len(items)))
+    for _ in range(passes):
+        H = -central(residual, x)
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+        innovation = residual(x) + H @ (x - prior)
+        x = prior + K @ innovation
+    return x, (np.eye(4) - K @ H) @ P, multivariate_normal(np.zeros(len(R)), H @ P @ H.T + R).logpdf(innovation)
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+def test_a_wrapped_residual_equals_the_dense_filter(passes):
+    (model, _), belief, items, observed, truth = around()
+    k = 19  # just before the bearing jumps from pi to -pi: predicted on one side, seen on the other
+    near = ekf.Belief(jnp.asarray([*truth[k], 0.0, -0.3]), belief.covariance)
+    assert np.abs(observed[k + 1, :, 1] - jax.vmap(model.measure, (None, 0))(near.mean, items)[:, 1]).max() > 6
+    found, says = update(model, near, items, observed[k + 1], jnp.ones(3, bool), passes=passes)
+    arrays = (np.asarray(a) for a in (items, observed[k + 1], model.sigma))
+    x, P, log_likelihood = bearing_update(near, *arrays, passes)
+    np.testing.assert_allclose(found.mean, x, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, P, atol=1e-8)
+    np.testing.assert_allclose(says.log_likelihood, log_likelihood, rtol=1e-6)
+
+
+def test_a_bearing_is_followed_through_pi_where_a_plain_difference_is_not():
+    models, belief, items, observed, truth = around(
+        200
+    )  # so slow that the noise takes a bearing across pi where the prediction is not
+    seen = jnp.ones(observed.shape[:2], bool)
+    # In one pass: more of them may find the way around to where the raw bearing fits again.
+    right, wrong = (filter_(m, belief, items, observed, seen, passes=1)[0].mean[:, :2] - truth for m in models)
+    assert np.abs(right).max() < 0.15
+    assert np.abs(wrong).max() > 1
+
+
+def test_a_residual_may_be_robust_masked_and_differentiated():
+    """What is masked changes nothing, NaN included; outliers are left out; the gradient is that of differences."""
+    (model, _), belief, items, observed, truth = around()
+    rng = np.random.default_rng(1)
+    mask, wild = rng.random(observed.shape[:2]) < 0.8, np.zeros(observed.shape[:2], bool)
+    mask[2::4], wild[2::4, 1] = True, True  # one of three, all of them seen
+    mask, observed = jnp.asarray(mask), observed + jnp.asarray(wild)[..., None] * jnp.array([3.0, 2.0])
+
+    def run(observed):
+        return filter_(model, belief, items, observed, mask, passes=9, robust=ROBUST)
+
+    beliefs, said = run(observed)
+    assert np.abs(beliefs.mean[:, :2] - truth).max() < 0.2
+    assert not said.weights[wild].any()
+    for junk in (jnp.nan, jnp.inf, 1e30):
+        assert_trees_close(run(jnp.where(mask[..., None], observed, junk)), (beliefs, said), rtol=1e-12)
+
+    @jax.jit
+    def loss(sigma, observed):
+        told = eqx.tree_at(lambda m: m.sigma, model, sigma)
+        said = ekf.filter(told, belief, items, observed, mask, passes=9, robust=ROBUST)[1]
+        return jnp.sum(said.log_likelihood)
+
+    dirty = jnp.where(mask[..., None], observed, jnp.nan)
+    by_sigma, by_observed = jax.jit(jax.grad(loss, argnums=(0, 1)))(model.sigma, dirty)
+    differences = central(lambda x: loss(jnp.asarray(x), dirty), np.asarray(model.sigma))
+    np.testing.assert_allclose(by_sigma, differences, rtol=1e-4)
+    assert np.isfinite(by_observed).all()
+    assert not by_observed[~mask].any()

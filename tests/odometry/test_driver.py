@@ -216,6 +216,51 @@ def test_a_changing_number_of_features_never_recompiles():
     assert step_tracks._cache_size() == compiled
 
 
+def test_a_number_of_tracks_more_compiles_nothing():
+    tracks = sideways(30)
+    more = [np.concatenate([x, x[:, :23]], axis=1) for x in (tracks.pixels, tracks.visible)]  # 151 columns
+    follow_tracks(tracks.camera, *(x[:, :150] for x in more))
+    compiled = step_tracks._cache_size()
+    follow_tracks(tracks.camera, *more)
+    assert step_tracks._cache_size() == compiled
+
+
+def test_rows_may_come_in_any_order_and_number():
+    """A track keeps its slot whatever its row: from its second frame on nothing but the numbers counts."""
+    tracks, rng = sideways(30), np.random.default_rng(0)
+    columns, rows = (Odometry(tracks.camera, capacity=CAPACITY) for _ in range(2))
+    for k, (pixels, visible) in enumerate(zip(tracks.pixels, tracks.visible, strict=True)):
+        order = np.arange(CAPACITY) if k == 0 else rng.permutation(CAPACITY)
+        # Of those that are not visible some come along, and some do not.
+        order = order[visible[order] | (rng.random(CAPACITY) < 0.5)] if k else order
+        given_up = columns.add(pixels, visible, float(k)), rows.add(pixels[order], visible[order], float(k), ids=order)
+        np.testing.assert_array_equal(given_up[0][order], given_up[1])
+    for found, expected in zip(rows.poses, columns.poses, strict=True):
+        assert (found.status, found.used) == (expected.status, expected.used)
+        np.testing.assert_array_equal(found.T_camera_world, expected.T_camera_world)
+        np.testing.assert_array_equal(found.covariance, expected.covariance)
+    jax.tree.map(np.testing.assert_array_equal, rows.points(), columns.points())
+
+
+def test_the_latest_frame_is_the_newest_that_has_been_taken_in():
+    tracks, lag = sideways(20), 4
+    odometry = Odometry(tracks.camera, start=StartSettings(lag=lag))
+    assert odometry.latest is None
+    behind, known = [], []
+    for k in range(20):
+        odometry.add(tracks.pixels[k], tracks.visible[k], float(k))
+        behind.append(k - int(odometry.latest.time))
+        known.append(odometry.latest.T_camera_world is not None)
+    begun = known.index(True)
+    assert not any(known[:begun])
+    assert all(known[begun:])
+    # The frames wait while the start is worked out, then two are taken in for each that comes.
+    assert behind[:begun] == [0] * (begun - lag + 1) + list(range(1, lag))
+    assert behind[begun:] == [*range(lag - 2, 0, -1), *[0] * (20 - begun - lag + 2)]
+    assert odometry.latest is odometry.poses[-1]
+    assert odometry.latest.status is Status.TRACKING
+
+
 def test_the_paper_start_overlaps_as_asked():
     tracks = sideways(30)
     start = dataclasses.replace(StartSettings.of(Base.PAPER), restart=0.97, overlap=3)
