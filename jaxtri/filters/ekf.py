@@ -18,7 +18,7 @@ from jaxtri.checks import checked
 from jaxtri.filters import projective
 from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown, weigh
 from jaxtri.filters.linalg import Inverse, Prior, linearised, whiten
-from jaxtri.filters.masks import replace_masked, safe_root, stand_in
+from jaxtri.filters.masks import replace_masked, safe_root, seen, stand_in
 from jaxtri.filters.model import Belief, Dynamics, Mean, Model, change_of_origin, predict
 from jaxtri.filters.projective import Moments, Projective
 from jaxtri.filters.scan import checkpointed, each_frame
@@ -97,15 +97,15 @@ def _linearise(
     """Residual, Jacobian with respect to the error of the *prior*, and noise, at `retract(prior, delta)`."""
     compare = getattr(model, "residual", jnp.subtract)
     # A copy of another observation stands in for what is masked: a residual may be singular at zero.
-    seen = stand_in(mask, observed)
+    filled = stand_in(mask, observed)
 
     def residual(error: Array) -> Array:
         mean = model.retract(prior, error)
-        return jax.vmap(compare)(seen, _each(lambda item: model.measure(mean, item), items, len(seen)))
+        return jax.vmap(compare)(filled, _each(lambda item: model.measure(mean, item), items, len(filled)))
 
     left, slope = linearised(residual, delta)
     mean = model.retract(prior, delta)
-    noise = _each(lambda item: model.noise(mean, item), items, len(seen))
+    noise = _each(lambda item: model.noise(mean, item), items, len(filled))
     if scale is not None:
         noise = noise * jnp.square(scale)[:, None, None]
     whitener, log_det = jax.vmap(whiten)(noise)
@@ -223,7 +223,7 @@ def update(
     sigma is not positive; warns (`UnitsWarning`) where normalised image points are clearly pixels.
     """
     P, mean = belief.covariance, belief.mean
-    mask = jnp.ones(len(observed), bool) if mask is None else mask
+    mask = seen(mask, observed.shape[:1])
     linearise, support, components = _measuring(model, belief, items, mask)
     noise_scale, observed = replace_masked(mask, noise_scale, 1.0), replace_masked(mask, observed, 0.0)
     considered = getattr(model, "considered", None)
@@ -284,13 +284,13 @@ def filter(
     time since the frame before, one for all or one a frame, 1 by default. A reverse gradient keeps a belief a frame;
     of a long sequence, with `block`, one in every `block` frames: `jaxtri.filters.scan`.
     """
-    mask = jnp.ones(observed.shape[:2], bool) if mask is None else mask
+    mask = seen(mask, observed.shape[:2])
     steps = each_frame(dt, len(observed), belief.covariance.dtype)
     items = prepare(model, items, mask.any(axis=0))
 
     def body(carry: Belief, frame: tuple) -> tuple[Belief, tuple]:
-        z, seen, elapsed = frame
-        carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
+        z, visible, elapsed = frame
+        carry, diagnostics = step(model, carry, items, z, visible, elapsed, passes=passes, robust=robust)
         return carry, (carry, diagnostics)
 
     # Checkpointed: the reverse pass keeps one belief a frame, and recomputes the rest.

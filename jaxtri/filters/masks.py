@@ -5,6 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 
+def seen(mask: Bool[Array, "*n"] | None, shape: tuple[int, ...]) -> Bool[Array, "*n"]:
+    """The mask, or where there is none one of the given shape that leaves nothing out."""
+    return jnp.ones(shape, bool) if mask is None else mask
+
+
 def select(mask: Bool[Array, " n"], new: PyTree, old: PyTree) -> PyTree:
     """Entry by entry of a leading axis n: `new` where the mask is True, `old` where it is False."""
 

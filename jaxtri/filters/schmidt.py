@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxtri.checks import checked
 from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown, weigh
 from jaxtri.filters.linalg import posterior_error, scales, whiten
-from jaxtri.filters.masks import replace_masked, safe_root, stand_in
+from jaxtri.filters.masks import replace_masked, safe_root, seen, stand_in
 from jaxtri.filters.model import Belief, Dynamics, Mean, change_of_origin, transition
 from jaxtri.filters.scan import checkpointed, each_frame
 
@@ -237,7 +237,7 @@ def update(
     The passes before the last seek the point of linearisation and take the items' errors for new; the last
     one's gain is Schmidt's.
     """
-    mask = jnp.ones(len(observed), bool) if mask is None else mask
+    mask = seen(mask, observed.shape[:1])
     passes = count_passes(passes, robust)
     present = mask if absorb is None else mask | absorb
     item_noise = model.item_noise(belief.mean, items)
@@ -310,12 +310,12 @@ def filter(
     block: int = 1,
 ) -> tuple[Belief[Mean], Diagnostics]:
     """Beliefs, with their whole covariance, and diagnostics of all frames: as `jaxtri.ekf.filter`."""
-    mask = jnp.ones(observed.shape[:2], bool) if mask is None else mask
+    mask = seen(mask, observed.shape[:2])
     steps = each_frame(dt, len(observed), belief.own.dtype)
 
     def body(carry: ConsiderBelief, frame: tuple) -> tuple[ConsiderBelief, tuple]:
-        z, seen, elapsed = frame
-        carry, diagnostics = step(model, carry, items, z, seen, elapsed, passes=passes, robust=robust)
+        z, visible, elapsed = frame
+        carry, diagnostics = step(model, carry, items, z, visible, elapsed, passes=passes, robust=robust)
         return carry, (total(model, carry, items), diagnostics)
 
     return checkpointed(body, belief, (observed, mask, steps), block)[1]

@@ -123,26 +123,26 @@ class Settings(eqx.Module):
         focal = jnp.sqrt(camera.fx * camera.fy)
         width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
 
-        def number(x: float) -> Array:
+        def scalar(x: float) -> Array:
             # In the camera's dtype: the fields' own converter takes JAX's default one.
             return jnp.asarray(x, focal.dtype)
 
         return cls(
             sigma=noise_px / focal,
-            acceleration=number(0.02),
-            angular_acceleration=number(0.02),
+            acceleration=scalar(0.02),
+            angular_acceleration=scalar(0.02),
             keyframe_flow=0.035 * width / focal,
-            keyframe_common=number(20),
-            keyframe_usable=number(0.3),
-            usable_parallax=jnp.deg2rad(number(0.3)),
-            fixed_parallax=jnp.deg2rad(number(1.5)),
+            keyframe_common=scalar(20),
+            keyframe_usable=scalar(0.3),
+            usable_parallax=jnp.deg2rad(scalar(0.3)),
+            fixed_parallax=jnp.deg2rad(scalar(1.5)),
             epipolar_gate=1.5 / focal,
-            outlier=number(30.0),
-            minimum=number(8),
-            patience=number(15),
+            outlier=scalar(30.0),
+            minimum=scalar(8),
+            patience=scalar(15),
             # From 1e4, where `Robust` begins at 1e5: eight passes bring the scale down by a factor of 2.9 each, more
             # gently than the nine from 1e5 (3.5), and a frame costs a pass less.
-            robust=ekf.Robust(number(1e4), number(16.0), number(13.8), passes=passes),
+            robust=ekf.Robust(scalar(1e4), scalar(16.0), scalar(13.8), passes=passes),
             passes=passes,
         )
 
