@@ -43,11 +43,7 @@ VAGUE = 100.0
 THINNED = 12  # keyframes from which the middle of a window is far enough from its end to be thinned out
 AGREES = 0.25  # robust weight from which an observation is one of the point
 STEPS_OF_START = 6  # a start's points begin far off; those of later keyframes begin nearly right
-DAMPING, WORSE, BETTER = (
-    1e-4,
-    10.0,
-    0.1,
-)  # of Levenberg and Marquardt: at first, after a step not taken, after one taken
+DAMPING, BETTER = 1e-4, 0.1  # of the equations of a step: at first, and from step to step
 
 
 class Window(NamedTuple):
@@ -165,7 +161,7 @@ def add(
 
 
 class _Estimate(NamedTuple):
-    """Poses and points, the normal equations of the poses there, and the cost."""
+    """Poses and points, and the normal equations of the poses there."""
 
     poses: SE3
     points: Points
@@ -173,7 +169,6 @@ class _Estimate(NamedTuple):
     reduced: Reduced
     information: Float[Array, "s s"]
     pull: Float[Array, " s"]
-    cost: Float[Array, ""]
     damping: Float[Array, ""]
 
 
@@ -197,11 +192,10 @@ def _improved(
     def estimate(poses: SE3, points: Points, damping: Array) -> _Estimate:
         said = linearise(poses, points, views, settings.sigma, scale)
         reduced = reduce(said, points, vague)
-        x, information, pull = _carried(window, poses)
-        cost = said.cost + x @ (window.information @ x) - 2 * window.pull @ x
+        information, pull = _carried(window, poses)
         information = information + reduced.information + jnp.diag(empty.astype(dtype))
         information = information + _blocks(_pinned(window, poses, depth))
-        return _Estimate(poses, points, said, reduced, information, pull + reduced.pull, cost, damping)
+        return _Estimate(poses, points, said, reduced, information, pull + reduced.pull, damping)
 
     # Every step is taken: one that is taken or not by its cost would make steps in the result's derivative.
     def step(best: _Estimate, _: None) -> tuple[_Estimate, None]:
@@ -247,7 +241,7 @@ def _left(
     cut = 1 + (rank + window.made) % (k - 2)
     folded = window.mask & (over | (oldest & window.mask[0] & (index[:, None] < cut)))
     told = reduce(best.said, best.points, vague, folded)
-    _, information, pull = _carried(window, best.poses)
+    information, pull = _carried(window, best.poses)
     information, pull = information + told.information, pull + told.pull
     mask = (window.mask & ~folded & ~over).at[-1].set(visible)
     # The one that leaves comes first, and its place becomes empty.
@@ -310,8 +304,8 @@ def _gauge(poses: SE3) -> Float[Array, "s 7"]:
     return jax.vmap(one)(poses).reshape(-1, 7)
 
 
-def _carried(window: Window, poses: SE3) -> tuple[Float[Array, " s"], Float[Array, "s s"], Float[Array, " s"]]:
-    """The error at other poses, and what has left the window says about these: its information and pull.
+def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+    """What has left the window says about other poses: its information and pull.
 
     The derivative is corrected so that a similarity of the world changes as little there as it did before. Without,
     what was said at several estimates would say something of the scale, which nobody has seen: that made it drift.
@@ -327,7 +321,7 @@ def _carried(window: Window, poses: SE3) -> tuple[Float[Array, " s"], Float[Arra
     size = jnp.sqrt(jnp.sum(now**2, axis=0))
     before, now = before / size, now / size
     A = A + (before - A @ now) @ solver(now.T @ now)(now.T)
-    return x, A.T @ window.information @ A, A.T @ (window.pull - window.information @ x)
+    return A.T @ window.information @ A, A.T @ (window.pull - window.information @ x)
 
 
 def _begun(window: Window, depth: Float[Array, ""]) -> tuple[Points, Float[Array, " n"]]:

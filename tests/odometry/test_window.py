@@ -117,7 +117,7 @@ def test_a_similarity_of_the_world_changes_nothing_of_the_prior():
     )
     rng = np.random.default_rng(0)
     moved = jax.vmap(retract)(window.poses, jnp.asarray(rng.normal(size=(6, 6)) * 0.01))
-    _, information, pull = windows._carried(blind, moved)
+    information, pull = windows._carried(blind, moved)
     now = np.asarray(windows._gauge(moved))
     size = np.linalg.norm(np.asarray(information)) * np.linalg.norm(now, axis=0)
     assert (np.linalg.norm(np.asarray(information) @ now, axis=0) < 1e-9 * size).all()
