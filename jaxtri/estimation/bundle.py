@@ -170,9 +170,14 @@ def reduce(said: Linearised, points: Points, prior: PointPrior, mask: Bool[Array
     cross = jnp.sum(pose[:, :, None] * rooted[:, None], axis=3).reshape(6 * k, 3, n)
     flat, each = cross.reshape(6 * k, 3 * n), pose.reshape(k, 6, 2 * n)
     U = jnp.einsum("kem,kfm->kef", each, each)
-    own = (U[:, :, None, :] * jnp.eye(k, dtype=U.dtype)[:, None, :, None]).reshape(6 * k, 6 * k)
     direct = jnp.einsum("kem,km->ke", each, residual.reshape(k, 2 * n)).reshape(6 * k)
-    return Reduced(own - flat @ flat.T, direct - flat @ offset.reshape(-1), root, cross, offset)
+    return Reduced(block_diagonal(U) - flat @ flat.T, direct - flat @ offset.reshape(-1), root, cross, offset)
+
+
+def block_diagonal(each: Float[Array, "k e e"]) -> Float[Array, "s s"]:
+    """The matrix that has these blocks on its diagonal."""
+    k, e, _ = each.shape
+    return (each[:, :, None] * jnp.eye(k, dtype=each.dtype)[:, None, :, None]).reshape(k * e, k * e)
 
 
 def _inverse_root(V: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:

@@ -22,6 +22,7 @@ from jaxtri.estimation.bundle import (
     Points,
     Reduced,
     Views,
+    block_diagonal,
     linearise,
     reduce,
     seen_from,
@@ -51,7 +52,7 @@ class Window(NamedTuple):
 
     Attributes:
         poses: (k,) world to camera; the newest is the last.
-        kept: How many of them, from the last one back, are window.
+        kept: How many of them, from the last one back, are keyframes.
         made: How many were made so far.
         observed: (2, k, n) normalised image points.
         mask: (k, n) which of them are seen.
@@ -169,6 +170,7 @@ class _Estimate(NamedTuple):
     reduced: Reduced
     information: Float[Array, "s s"]
     pull: Float[Array, " s"]
+    carried: tuple[Float[Array, "s s"], Float[Array, " s"]]  # what has left the window says there
     damping: Float[Array, ""]
 
 
@@ -192,10 +194,10 @@ def _improved(
     def estimate(poses: SE3, points: Points, damping: Array) -> _Estimate:
         said = linearise(poses, points, views, settings.sigma, scale)
         reduced = reduce(said, points, vague)
-        information, pull = _carried(window, poses)
+        carried = information, pull = _carried(window, poses)
         information = information + reduced.information + jnp.diag(empty.astype(dtype))
-        information = information + _blocks(_pinned(window, poses, depth))
-        return _Estimate(poses, points, said, reduced, information, pull + reduced.pull, damping)
+        information = information + block_diagonal(_pinned(window, poses, depth))
+        return _Estimate(poses, points, said, reduced, information, pull + reduced.pull, carried, damping)
 
     # Every step is taken: one that is taken or not by its cost would make steps in the result's derivative.
     def step(best: _Estimate, _: None) -> tuple[_Estimate, None]:
@@ -241,7 +243,7 @@ def _left(
     cut = 1 + (rank + window.made) % (k - 2)
     folded = window.mask & (over | (oldest & window.mask[0] & (index[:, None] < cut)))
     told = reduce(best.said, best.points, vague, folded)
-    information, pull = _carried(window, best.poses)
+    information, pull = best.carried
     information, pull = information + told.information, pull + told.pull
     mask = (window.mask & ~folded & ~over).at[-1].set(visible)
     # The one that leaves comes first, and its place becomes empty.
@@ -280,12 +282,6 @@ def _pinned(window: Window, poses: SE3, depth: Float[Array, ""]) -> Float[Array,
     return jax.vmap(one)(window.role, poses)
 
 
-def _blocks(each: Float[Array, "k 6 6"]) -> Float[Array, "s s"]:
-    """The matrix that has these blocks on its diagonal."""
-    k = len(each)
-    return (each[:, :, None] * jnp.eye(k, dtype=each.dtype)[:, None, :, None]).reshape(6 * k, 6 * k)
-
-
 def _without_first(information: Float[Array, "s s"], pull: Float[Array, " s"]) -> tuple[Array, Array]:
     """The first pose marginalised; zeros stand in its place."""
     across = solver(information[:6, :6])(jnp.concatenate([information[:6, 6:], pull[:6, None]], axis=1))
@@ -316,7 +312,7 @@ def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Arr
         return linearised(lambda e: local(a, retract(b, e)), jnp.zeros(6, window.pull.dtype))
 
     x, each = jax.vmap(one)(window.poses, poses)
-    x, A = x.reshape(-1), _blocks(each)
+    x, A = x.reshape(-1), block_diagonal(each)
     before, now = _gauge(window.poses), _gauge(poses)
     size = jnp.sqrt(jnp.sum(now**2, axis=0))
     before, now = before / size, now / size
