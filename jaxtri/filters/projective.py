@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 Mean = TypeVar("Mean")
 
@@ -107,23 +107,13 @@ class Evidence(eqx.Module):
         D = self.slope.reshape(3 * q, -1)
         return D.T @ (K @ D), pull.ravel() @ D
 
-    def coupling(
-        self, weights: Float[Array, " n"], levers: Float[Array, "n q e"], groups: Int[Array, " n"], k: int
-    ) -> Float[Array, "s ke"]:
-        """Sum w H' W L of the items of each of k groups, L the derivative of the image by e errors of the group.
-
-        `levers` are the derivatives of the coordinates; an item whose group is negative counts nothing.
-        """
-        n, q, e = levers.shape
-        # V = B' W B M lever of each item; H' W L is the slope times c V'.
+    def coupling(self, weights: Float[Array, " n"], levers: Float[Array, "q e n"]) -> Float[Array, "s e n"]:
+        """w H' W L of each item, L the derivative of its image by e errors; `levers` are those of its coordinates."""
+        q, e, n = levers.shape
         six = self._information(self._weighted(weights))
-        moved = jnp.moveaxis(levers, 0, -1).reshape(q, e * n)
-        moved = (self.map @ moved).reshape(3, e, n)
-        V = jnp.einsum("abn,ben->aen", six[_symmetric(3)], moved)
-        each = (self.items.coordinates[:, None, None] * V).reshape(q * 3 * e, n)
-        member = groups[:, None] == jnp.arange(k)
-        sums = (each @ member.astype(each.dtype)).reshape(q, 3, e, k)
-        return jnp.einsum("aqs,qaek->ske", self.slope, sums).reshape(-1, k * e)
+        moved = (self.map @ levers.reshape(q, e * n)).reshape(3, e, n)
+        turned = (jnp.moveaxis(self.slope, 1, -1).reshape(-1, q) @ self.items.coordinates).reshape(3, -1, n)
+        return jnp.einsum("asn,abn,ben->sen", turned, six[_symmetric(3)], moved)
 
     def _weighted(self, weights: Float[Array, " n"]) -> Float[Array, "3 n"]:
         return self.weight * (weights / self.depth)

@@ -22,15 +22,16 @@ from jaxtri.models.point_noise import SIGMA
 
 
 class BasePoint(NamedTuple):
-    """A world point fixed by a base pair.
+    """A world point fixed by a base pair, or by more.
 
     Attributes:
         point: (4,) homogeneous, scene units.
-        spread: (4, 4) its derivative with respect to the two observations, normalised image points.
+        spread: (4, p) its derivative with respect to p independent errors of the standard deviation of an image point:
+            of a pair those of its two observations.
     """
 
     point: Float[Array, "4"]
-    spread: Float[Array, "4 4"]
+    spread: Float[Array, "4 p"]
 
 
 def base_point(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, pose2: SE3) -> BasePoint:
@@ -42,17 +43,6 @@ def base_point(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, 
 
     pair = jnp.concatenate([first, second])
     return BasePoint(point(pair), jax.jacfwd(point)(pair))
-
-
-def base_lever(first: Float[Array, "2"], second: Float[Array, "2"], pose1: SE3, pose2: SE3) -> Float[Array, "4 12"]:
-    """Derivative of the base point with respect to the errors of the two base poses (left perturbations)."""
-
-    def point(errors: Array) -> Array:
-        one, two = retract(pose1, errors[:6]), retract(pose2, errors[6:])
-        R1, R2 = one.rotation().as_matrix(), two.rotation().as_matrix()
-        return point_from_bases(first, second, R1, one.translation(), R2, two.translation())
-
-    return jax.jacfwd(point)(jnp.zeros(12, first.dtype))
 
 
 class BasePairs(eqx.Module):
@@ -114,11 +104,11 @@ class BasePairs(eqx.Module):
         """The homogeneous point, which the camera matrix projects."""
         return item.point
 
-    def spread(self, item: BasePoint) -> Float[Array, "4 4"]:
-        """Derivative of the homogeneous point with respect to the two base observations."""
+    def spread(self, item: BasePoint) -> Float[Array, "4 p"]:
+        """Derivative of the homogeneous point with respect to its own errors."""
         return item.spread
 
     def noise(self, mean: Twist, item: BasePoint) -> Float[Array, "2 2"]:
-        """sigma^2 (I + J J'), J the derivative of the transfer with respect to the two base observations."""
+        """sigma^2 (I + J J'), J the derivative of the transfer with respect to the point's own errors."""
         J = jax.jacfwd(lambda X: self._project(mean, X))(item.point) @ item.spread
         return jnp.square(self.sigma) * (jnp.eye(2, dtype=J.dtype) + J @ J.T)

@@ -373,7 +373,7 @@ class Odometry(Archived):
         state = state._replace(belief=eqx.tree_at(lambda b: b.mean, state.belief, mean))
         for frame in reversed(self._passed):
             state, report = hold(self._settings, state, frame, first.common(frame), 1.0)
-            if int(report.status) != Status.TRACKING:
+            if not Status(int(report.status)).measured:
                 return
             yield frame, report
 

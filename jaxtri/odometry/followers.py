@@ -77,7 +77,7 @@ class TrackPairs:
         """The pose of the next frame."""
         fresh = frame.visible & (frame.ids != self.known)
         over = (self.known >= 0) & (fresh | ~frame.visible)
-        self.structure.end(self.state.structure, over & self._good(), self.known)
+        self.structure.end(self.state.tracks.base, over & self._good(), self.known)
         self.known = np.where(frame.visible, frame.ids, -1)
         self.state, report = step_tracks(
             self.settings, self.state, frame.u, frame.visible, fresh, dt, hold=np.False_, quality=frame.quality
@@ -86,8 +86,8 @@ class TrackPairs:
         return report
 
     def _good(self) -> np.ndarray:
-        # What no base pair agrees on is not a point of the scene.
-        return np.asarray(self.state.tracks.usable) & np.asarray(self.state.born)
+        # What its looks do not agree on is not a point of the scene.
+        return np.asarray(self.state.tracks.usable)
 
     def ended(self) -> Points:
         """The points of tracks that have ended since the last call."""
@@ -95,7 +95,7 @@ class TrackPairs:
 
     def present(self) -> Points:
         """The points of the tracks that are followed now."""
-        return self.structure.of(self.state.structure, self._good(), self.known)
+        return self.structure.of(self.state.tracks.base, self._good(), self.known)
 
 
 @dataclass
@@ -151,7 +151,7 @@ class SinglePair:
             if report is not None:
                 return report
         report = self._advance(frame, dt)
-        if short and self.base is Base.INHERIT and int(report.status) == Status.TRACKING:
+        if short and self.base is Base.INHERIT and Status(int(report.status)).measured:
             self._inherit()
         return report
 

@@ -1,6 +1,6 @@
 """One frame measured, whichever base frames its tracks stand on: predict, update, and judge what came of it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,13 @@ from jaxtri.odometry.settings import Settings, Status
 
 # Share of the measured tracks that must agree for an update to stand: below it most of what is seen contradicts it.
 LEAST_SHARE = 0.25
+# A measured frame is in doubt where the normalised innovation squared of its points is so many times what it should be
+# (of points that agree with nothing, and lie evenly in the gate, it is 3.45 times that), where no more than this share
+# of what was measured agrees, and where a rotation is known to no more than this angle (radians).
+MISFIT, MINORITY, BLURRED = 2.5, 0.5, 0.0175
+# Standard deviation of the first pose, in scene depths and radians. It is the gauge, so this is as good as exact, far
+# below what any image tells; at zero its components would have no scale.
+GAUGE = 1e-6
 # Standard deviation of the velocity at a start, in scene depths and in radians per frame: at video rate it is all but
 # unknown, and the first update fixes it.
 START_VELOCITY = 0.05
@@ -80,8 +87,35 @@ def measure(
     return Measured(belief, taken, coasted, status, taken & mask & (said.distance > settings.outlier), said)
 
 
-def median(x: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Median of the unmasked entries; 1 where there is none."""
+class Doubts(NamedTuple):
+    """What speaks against a measured pose.
+
+    Attributes:
+        misfit: The points that agree fit much worse than their noise explains.
+        minority: Fewer than half of the points measured agree.
+        blurred: The rotation is known to a degree or worse.
+    """
+
+    misfit: Any
+    minority: Any
+    blurred: Any
+
+
+def doubts(nis: Any, used: Any, measured: Any, rotation_sd: Any) -> Doubts:
+    """Of a frame's numbers, of JAX's, NumPy's or Python's kind; `rotation_sd` in radians."""
+    return Doubts(nis > MISFIT * 2 * used, used < MINORITY * measured, rotation_sd > BLURRED)
+
+
+def judged(status: Int[Array, ""], covariance: Float[Array, "6 6"], said: ekf.Diagnostics) -> Int[Array, ""]:
+    """The status of a frame once the covariance of its pose is known: a measured one may be uncertain."""
+    sd = jnp.sqrt(jnp.max(jnp.diagonal(covariance)[3:]))
+    found = doubts(said.nis, said.used, said.measured, sd)
+    doubted = (status == Status.TRACKING) & (found.misfit | found.minority | found.blurred)
+    return jnp.where(doubted, Status.UNCERTAIN, status).astype(jnp.int32)
+
+
+def median(x: Float[Array, " n"], mask: Bool[Array, " n"], without: float = 1.0) -> Float[Array, ""]:
+    """Median of the unmasked entries; `without` where there is none."""
     ordered = jnp.sort(jnp.where(mask, x, jnp.inf))
     count = jnp.sum(mask)
-    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], jnp.ones((), x.dtype))
+    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], jnp.asarray(without, x.dtype))

@@ -1,5 +1,6 @@
 """Poses of single frames on the host, and the trajectory that they make."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxlie import SE3
 
 from jaxtri.errors import InitialisationError
+from jaxtri.odometry.measuring import doubts
 from jaxtri.odometry.settings import Report, Status
 from jaxtri.trajectory import Trajectory
 
@@ -26,6 +28,8 @@ class FramePose:
             units and radians; None where there is no pose.
         used: How many points agreed.
         nis: Normalised innovation squared of these points: 2 `used` is right. NaN where nothing was measured.
+        measured: How many points were measured.
+        parallax_deg: Median angle between the rays that the points used are known from; NaN where there is none.
     """
 
     time: float
@@ -34,13 +38,45 @@ class FramePose:
     covariance: np.ndarray | None = None
     used: int = 0
     nis: float = float("nan")
+    measured: int = 0
+    parallax_deg: float = float("nan")
 
     @classmethod
     def of(cls, time: float, report: Report) -> "FramePose":
         """The pose of a frame from what the filter reports of it."""
         said, status = report.diagnostics, Status(int(report.status))
         covariance = np.asarray(report.covariance, np.float64)
-        return cls(time, status, pose_matrix(report.pose), covariance, int(said.used), float(said.nis))
+        counts, angle = (int(said.used), float(said.nis), int(said.measured)), math.degrees(report.parallax)
+        return cls(time, status, pose_matrix(report.pose), covariance, *counts, angle)
+
+    @property
+    def rotation_sd_deg(self) -> float:
+        """Standard deviation of the rotation about the camera axis where it is largest; NaN where there is no pose."""
+        return math.nan if self.covariance is None else math.degrees(np.sqrt(self.covariance.diagonal()[3:].max()))
+
+    @property
+    def position_sd(self) -> float:
+        """Standard deviation of the position along the camera axis where it is largest, scene units; NaN without."""
+        return math.nan if self.covariance is None else float(np.sqrt(self.covariance.diagonal()[:3].max()))
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why the frame is uncertain, in words; empty where it is not."""
+        if self.status is not Status.UNCERTAIN:
+            return []
+        found = doubts(self.nis, self.used, self.measured, math.radians(self.rotation_sd_deg))
+        words = {
+            "its points fit {worse:.1f} times worse than their noise explains": found.misfit,
+            "only {used} of {measured} points agree": found.minority,
+            "its rotation is known to {sd:.1f} degrees": found.blurred,
+        }
+        numbers = {
+            "worse": math.sqrt(self.nis / (2 * self.used)) if self.used else math.nan,
+            "used": self.used,
+            "measured": self.measured,
+            "sd": self.rotation_sd_deg,
+        }
+        return [word.format(**numbers) for word, true in words.items() if true]
 
     def scaled(self, scale: float) -> "FramePose":
         """The pose in other units of length."""

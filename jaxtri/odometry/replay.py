@@ -20,7 +20,7 @@ from jaxtri.estimation.two_view import TwoView, refine
 from jaxtri.filters.scan import checkpointed
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
-from jaxtri.geometry.pose import compose, shear
+from jaxtri.geometry.pose import compose
 from jaxtri.odometry import single_pair, track_pairs
 from jaxtri.odometry.settings import Report, Settings
 
@@ -91,9 +91,8 @@ def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: i
     view = recording.start(settings, u)
     ids, visible, second = recording.ids, recording.visible, recording.second[0]
     common = visible[0] & visible[second] & (ids[0] == ids[second])
-    J = shear(view.translation)
     pose = compose(view.rotation, view.translation)
-    state = track_pairs.init(settings, u[0], u[second], common, pose, J @ view.covariance @ J.T)
+    state = track_pairs.init(settings, u[0], u[second], common, pose)
     # Up to the second base frame only the pair's tracks are measured; what else is there begins after it.
     at = jnp.arange(1, len(ids))[:, None]
     same = visible[:-1] & visible[1:] & (ids[1:] == ids[:-1])

@@ -18,7 +18,7 @@ from jaxtri.errors import CameraError, InputError
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.driver import Odometry
-from jaxtri.odometry.settings import Base, Settings, StartSettings, Status
+from jaxtri.odometry.settings import Base, Settings, StartSettings
 from jaxtri.odometry.structure import Points
 from jaxtri.trajectory import Trajectory
 from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
@@ -237,13 +237,27 @@ def _sample(colours: dict[int, np.ndarray], tracks: FrameTracks, image: np.ndarr
     colours |= dict(zip(tracks.ids[new].tolist(), image[y, x][:, ::-1], strict=True))
 
 
+def _figures(values: Iterable[float]) -> list[float]:
+    """To four figures: a file is for people, too."""
+    return [float(f"{x:.4g}") for x in values]
+
+
 def _statistics(odometry: Odometry) -> dict[str, object]:
     status = Counter(p.status.name.lower() for p in odometry.poses)
-    used = [p.used for p in odometry.poses if p.status is Status.TRACKING]
+    used = [p.used for p in odometry.poses if p.status.measured]
     return {
         "frames": len(odometry.poses),
         "status": dict(status),
         "status_of_frame": [p.status.name.lower() for p in odometry.poses],
+        "doubts": {k: p.doubts for k, p in enumerate(odometry.poses) if p.doubts},
+        "evidence_of_frame": {
+            "nis_per_component": _figures(p.nis / (2 * p.used) if p.used else p.nis for p in odometry.poses),
+            "points_measured": [p.measured for p in odometry.poses],
+            "points_used": [p.used for p in odometry.poses],
+            "rotation_sd_deg": _figures(p.rotation_sd_deg for p in odometry.poses),
+            "position_sd": _figures(p.position_sd for p in odometry.poses),
+            "parallax_deg": _figures(p.parallax_deg for p in odometry.poses),
+        },
         "starts": odometry.starts,
         "restarts": odometry.changes,
         "scale_unknown_from_frame": odometry.scale_unknown_from,

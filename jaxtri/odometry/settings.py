@@ -45,6 +45,7 @@ class Status(IntEnum):
         COASTING: The pose is predicted, not measured: too few points agreed with it.
         RESTARTED: The first frame of a new start, after the camera was lost. From here on the scale is a guess.
         LOST: There is no pose: the camera coasted for too long, or too few tracks are left.
+        UNCERTAIN: The pose is measured, but its numbers do not hold together: `FramePose.doubts` says in words why.
     """
 
     INITIALISING = 0
@@ -52,14 +53,20 @@ class Status(IntEnum):
     COASTING = 2
     RESTARTED = 3
     LOST = 4
+    UNCERTAIN = 5
+
+    @property
+    def measured(self) -> bool:
+        """Whether the pose comes from what this frame shows."""
+        return self in (Status.TRACKING, Status.UNCERTAIN, Status.RESTARTED)
 
 
 class Settings(eqx.Module):
     """What a tracker run may tune; `Settings.of(camera)` fills it from pixels.
 
-    All fields but `passes` are leaves, scalars of one dtype. Lengths in the image are in normalised image units (pixels
-    over the focal length), angles in radians, times in frames. The defaults of `Settings.of` were found on the
-    sequences of `benchmarks/real_sequences.py`, and are the same for all of them.
+    All fields but `passes` and `refinements` are leaves, scalars of one dtype. Lengths in the image are in normalised
+    image units (pixels over the focal length), angles in radians, times in frames. The defaults of `Settings.of` were
+    found on the sequences of `benchmarks/real_sequences.py`, and are the same for all of them.
 
     Attributes:
         sigma: Standard deviation of an image point in normalised image units: noise_px / focal length. 0.4 px by
@@ -70,18 +77,18 @@ class Settings(eqx.Module):
         angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2. Higher and lower do
             what they do for `acceleration`.
         keyframe_flow: Median flow since the last keyframe, in normalised image units, from which a new keyframe is
-            made. 3.5 % of the image width by default. Higher gives longer base lines and fewer tracks that reach over
+            made. 2.6 % of the image width by default. Higher gives longer base lines and fewer tracks that reach over
             them.
         keyframe_common: How many tracks must be left from the last keyframe; where there are fewer, a new one is made,
             so that overlapping tracks can carry the scale.
-        keyframe_usable: Share of the visible tracks that must have a base pair which may measure; below it a new
-            keyframe is made. Higher brings new tracks into use sooner, from shorter base lines.
-        usable_parallax: Angle between the two rays of a track, in radians, from which its base pair may measure. 0.3
-            degrees by default. Lower uses new tracks sooner, whose depths are hardly known.
-        fixed_parallax: Angle in radians from which the base pair of a track is no longer replaced by a wider one. 1.5
-            degrees by default. In trials, replacing it still later helped some sequences and hurt others.
-        epipolar_gate: Largest Sampson distance of the two observations of a base pair, in normalised image units. 1.5
-            px by default, nearly four times the default noise.
+        keyframe_usable: Share of the visible tracks that must have a point which may measure; below it a new keyframe
+            is made. Higher brings new tracks into use sooner, from shorter base lines.
+        usable_parallax: Angle between the first and the last ray of a track, in radians, from which its point may
+            measure. 0.3 degrees by default. Lower uses new tracks sooner, whose depths are hardly known.
+        fixed_parallax: Angle in radians, three times which is enough between the two frames of a new pair
+            (`Base.INHERIT`): more of it gains little, and leaves fewer tracks. 1.5 degrees by default.
+        epipolar_gate: Largest Sampson distance of a track's two observations in the base pair of a start, in normalised
+            image units. 1.5 px by default, nearly four times the default noise.
         outlier: Squared Mahalanobis distance of a point above which its track is given up. More than twice the gate of
             `robust`, which 5 to 10 % of real tracks fail in a frame: one that fails it narrowly may go on.
         minimum: Fewest points that must agree on a pose. Higher coasts, and loses the camera, where fewer points are in
@@ -93,6 +100,8 @@ class Settings(eqx.Module):
             all. None by default: learned on five sequences it changes the error on the sixth by no more than chance
             (`benchmarks/tuning.py`).
         passes: Linearisations of an update (static). Eight bring the weights of `robust` from their start to their end.
+        refinements: Steps by which the window of keyframes is improved when one is made (static). A keyframe begins
+            nearly right, and those before it have been improved already.
     """
 
     sigma: Float[Array, ""] = eqx.field(converter=number)
@@ -110,6 +119,7 @@ class Settings(eqx.Module):
     robust: ekf.Robust
     point_noise: PointNoise | None = None
     passes: int = eqx.field(static=True, default=8)
+    refinements: int = eqx.field(static=True, default=1)
 
     @classmethod
     def of(cls, camera: Camera, *, noise_px: Float[Array, ""] | float = 0.4, passes: int = 8) -> "Settings":
@@ -129,9 +139,9 @@ class Settings(eqx.Module):
 
         return cls(
             sigma=noise_px / focal,
-            acceleration=scalar(0.02),
-            angular_acceleration=scalar(0.02),
-            keyframe_flow=0.035 * width / focal,
+            acceleration=scalar(0.2),
+            angular_acceleration=scalar(0.2),
+            keyframe_flow=0.026 * width / focal,
             keyframe_common=scalar(20),
             keyframe_usable=scalar(0.3),
             usable_parallax=jnp.deg2rad(scalar(0.3)),
@@ -197,6 +207,7 @@ class Report(NamedTuple):
             radians, the drift included.
         status: A `Status`, as an integer.
         keyframe: Whether the frame was made a keyframe.
+        parallax: Median angle in radians between the rays that the points used are known from.
         drop: (n,) tracks that are outliers: their slots may be filled anew.
         diagnostics: What the update found; see `jaxtri.Diagnostics`.
     """
@@ -205,5 +216,6 @@ class Report(NamedTuple):
     covariance: Float[Array, "6 6"]
     status: Int[Array, ""]
     keyframe: Bool[Array, ""]
+    parallax: Float[Array, ""]
     drop: Bool[Array, " n"]
     diagnostics: ekf.Diagnostics

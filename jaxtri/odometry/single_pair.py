@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtri.checks import checked
 from jaxtri.estimation.two_view import TwoView, refine, scaled
 from jaxtri.filters import ekf
-from jaxtri.geometry.epipolar import inverse_depth, safe_norm
+from jaxtri.geometry.epipolar import inverse_depth, parallax, safe_norm
 from jaxtri.geometry.pose import adjoint, identity, multiply, relative, shear
 from jaxtri.models.depth import Bank
 from jaxtri.models.trifocal import Trifocal, TrifocalState, informative, start
-from jaxtri.odometry.measuring import FARTHEST, START_VELOCITY, measure, median, noise_scale, structure_model
+from jaxtri.odometry.measuring import FARTHEST, START_VELOCITY, judged, measure, median, noise_scale, structure_model
 from jaxtri.odometry.settings import Report, Settings, Status
 
 # Inverse depth of a pair over its standard deviation, from which it measures. Near the epipole a pair has no depth, and
@@ -153,7 +153,16 @@ def step(
     pose, covariance = world_pose(new)
     structure = structure_model(settings).step(state.structure, pose, observed, inside & ok, own_covariance(new), dt)
     new = new._replace(structure=structure)
-    return new, Report(pose, covariance, found.status, jnp.asarray(False), drop, found.diagnostics)
+    status = judged(found.status, covariance, found.diagnostics)
+    return new, Report(pose, covariance, status, jnp.asarray(False), _parallax(new), drop, found.diagnostics)
+
+
+def _parallax(state: State) -> Float[Array, ""]:
+    """Median angle between the two rays of the pairs, radians."""
+    mean = state.belief.mean
+    assert isinstance(mean.base_rotation, SO3)
+    R = mean.base_rotation.as_matrix()
+    return median(jax.vmap(lambda p: parallax(p[:2], p[2:], R))(state.pairs), state.inside, jnp.nan)
 
 
 def depths(state: State, view: SE3) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -276,4 +285,4 @@ def second_report(state: State) -> Report:
     unknown, count = jnp.full((), jnp.nan, nothing.dtype), jnp.sum(inside)
     diagnostics = ekf.Diagnostics(unknown, unknown, count, count, inside.astype(nothing.dtype), nothing)
     status = jnp.asarray(int(Status.TRACKING))
-    return Report(*world_pose(state), status, jnp.asarray(True), jnp.zeros_like(inside), diagnostics)
+    return Report(*world_pose(state), status, jnp.asarray(True), _parallax(state), jnp.zeros_like(inside), diagnostics)

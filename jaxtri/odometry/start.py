@@ -9,7 +9,7 @@ import numpy as np
 from jaxlie import SE3
 
 from jaxtri.estimation.two_view import TwoView
-from jaxtri.geometry.pose import compose, identity, shear
+from jaxtri.geometry.pose import compose, identity
 from jaxtri.odometry import track_pairs
 from jaxtri.odometry.settings import Report, Settings, StartSettings
 from jaxtri.vision.hypotheses import Hypothesis, hypotheses
@@ -115,9 +115,7 @@ def _transfer_cost(
     """Truncated squared distances of the points transferred to the frames between the pair."""
     pose = compose(h.pose.rotation, h.pose.translation)
     arrays = jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(h.inside)
-    state = init_tracks(
-        settings, *arrays, pose, jnp.zeros((6, 6), settings.sigma.dtype), world=identity(settings.sigma.dtype)
-    )
+    state = init_tracks(settings, *arrays, pose, world=identity(settings.sigma.dtype))
     cost, before = 0.0, first.index
     for frame in between:
         visible = first.common(frame) & h.inside
@@ -141,10 +139,8 @@ def fill(
     first, last = frames[0], frames[-1]
     common = first.common(last)
     pose = compose(two_view.rotation, two_view.translation)
-    J = shear(two_view.translation)
-    covariance = J @ two_view.covariance @ J.T
     arrays = jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(common)
-    state = init_tracks(settings, *arrays, pose, covariance, world=world)
+    state = init_tracks(settings, *arrays, pose, world=world)
     reports = []
     for frame, elapsed in zip(frames[1:], dt, strict=True):
         state, report = hold(settings, state, frame, first.common(frame) & common, elapsed)

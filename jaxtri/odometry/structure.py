@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxtri.compilation import capacity
+from jaxtri.models.base_pairs import BasePoint
 from jaxtri.models.depth import Bank
 from jaxtri.odometry.measuring import FARTHEST, structure_model
 from jaxtri.odometry.settings import Settings
@@ -37,9 +38,12 @@ def no_points() -> Points:
 
 
 @jax.jit
-def _world_points(bank: Bank, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _world_points(bank: Bank | BasePoint, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
     """World points (n, 3) of a bank, the covariance of each, and which of them are known well enough to be shown."""
-    points, covariance = structure_model(settings).world(bank)
+    if isinstance(bank, BasePoint):
+        points, covariance = bank.point, settings.sigma**2 * bank.spread @ bank.spread.swapaxes(1, 2)
+    else:
+        points, covariance = structure_model(settings).world(bank)
 
     def one(X: Array, C: Array) -> tuple[Array, Array]:
         w = jnp.where(jnp.abs(X[3]) > FARTHEST, X[3], FARTHEST)
@@ -59,15 +63,15 @@ class Structure:
     """
 
     settings: Settings
-    kept: list[tuple[Bank, np.ndarray]] = field(default_factory=list)
+    kept: list[tuple[Bank | BasePoint, np.ndarray]] = field(default_factory=list)
 
-    def of(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> Points:
+    def of(self, bank: Bank | BasePoint, good: np.ndarray, ids: np.ndarray) -> Points:
         """The known points of the `good` slots."""
         xyz, covariance, known = (np.asarray(x) for x in _world_points(bank, self.settings))
         good = good & known & np.isfinite(xyz).all(axis=1)
         return Points(ids[good], xyz[good], covariance[good])
 
-    def end(self, bank: Bank, good: np.ndarray, ids: np.ndarray) -> None:
+    def end(self, bank: Bank | BasePoint, good: np.ndarray, ids: np.ndarray) -> None:
         """Keep the points of the `good` slots, whose tracks have ended."""
         if good.any():
             self.kept.append((jax.tree.map(lambda x: np.asarray(x)[good], bank), ids[good]))

@@ -5,8 +5,6 @@ take a step to maximum likelihood, the points eliminated (`jaxtri.estimation.bun
 forgotten, and nothing is counted twice: a track that has ended becomes, with all its observations, what it says of the
 poses, a Gaussian, and a keyframe that leaves is marginalised out of that. A track that is still followed when the first
 keyframe that sees it leaves is cut in two: its older part becomes prior, its newer part goes on as a point of its own.
-
-The tracker does not measure from it yet: `jaxtri.odometry.track_pairs`.
 """
 
 from typing import NamedTuple
@@ -34,9 +32,6 @@ from jaxtri.geometry.pose import adjoint, identity, local, relative, retract
 from jaxtri.odometry.measuring import FARTHEST
 from jaxtri.odometry.settings import Settings
 
-# Standard deviation of the first pose, in scene depths and radians, and of the first base line, over its length. They
-# are the gauge, so this is as good as exact, far below what any image tells; at zero they would have no scale.
-GAUGE = 1e-6
 FAREST, NEAREST = 0.03, 30.0  # inverse depths, over that of the scene, between which a new point begins
 # Standard deviation of a point's inverse depth before it is seen, over that of the scene. So little that it only keeps
 # a matrix regular: at three times, the small pulls of thousands of points had moved the scale by a percent.
@@ -88,6 +83,7 @@ class Refined(NamedTuple):
         X: (4, n) homogeneous points.
         spread: (4, 3, n) their own errors, over sigma.
         lever: (6k, 3, n) what they owe to the poses.
+        angle: (n,) between the first and the newest ray of each point, radians.
         usable: (n,) points that may measure.
     """
 
@@ -95,6 +91,7 @@ class Refined(NamedTuple):
     X: Float[Array, "4 n"]
     spread: Float[Array, "4 3 n"]
     lever: Float[Array, "s 3 n"]
+    angle: Float[Array, " n"]
     usable: Bool[Array, " n"]
 
 
@@ -168,7 +165,8 @@ class _Estimate(NamedTuple):
     points: Points
     said: Linearised
     reduced: Reduced
-    information: Float[Array, "s s"]
+    free: Float[Array, "k 6 6"]  # what the gauge leaves of the poses' errors
+    information: Float[Array, "s s"]  # with the gauge held
     pull: Float[Array, " s"]
     carried: tuple[Float[Array, "s s"], Float[Array, " s"]]  # what has left the window says there
     damping: Float[Array, ""]
@@ -188,16 +186,15 @@ def _improved(
     points, angle = _begun(window, depth)
     vague = PointPrior(jnp.full(n, 1.0, dtype) / depth, jnp.full(n, VAGUE, dtype) / depth)
     views = Views(window.observed, window.mask)
-    empty = jnp.repeat(jnp.arange(k) < k - window.kept, 6)
     scale = settings.robust.scale.astype(dtype)
 
     def estimate(poses: SE3, points: Points, damping: Array) -> _Estimate:
         said = linearise(poses, points, views, settings.sigma, scale)
         reduced = reduce(said, points, vague)
         carried = information, pull = _carried(window, poses)
-        information = information + reduced.information + jnp.diag(empty.astype(dtype))
-        information = information + block_diagonal(_pinned(window, poses, depth))
-        return _Estimate(poses, points, said, reduced, information, pull + reduced.pull, carried, damping)
+        free = _free(window, poses)
+        held = _held(free, information + reduced.information, pull + reduced.pull)
+        return _Estimate(poses, points, said, reduced, free, *held, carried, damping)
 
     # Every step is taken: one that is taken or not by its cost would make steps in the result's derivative.
     def step(best: _Estimate, _: None) -> tuple[_Estimate, None]:
@@ -207,16 +204,14 @@ def _improved(
 
     begin = estimate(window.poses, points, jnp.asarray(DAMPING, dtype))
     best, _ = jax.lax.scan(step, begin, None, length=steps)
-    # Empty places in the window have neither error nor covariance.
-    full = ~empty
     covariance = solver(best.information)(jnp.eye(6 * k, dtype=dtype))
-    covariance = jnp.where(jnp.outer(full, full), (covariance + covariance.T) / 2, 0.0)
+    covariance = _projected(best.free, (covariance + covariance.T) / 2)
     spread = jnp.einsum("qsn,tsn->qtn", best.points.basis, best.reduced.root) / settings.sigma
-    lever = jnp.where(full[:, None, None], best.reduced.cross, 0.0) * settings.sigma
+    lever = best.reduced.cross * settings.sigma
     agree = jnp.sum(best.said.weights > AGREES, axis=0) >= 2
     usable = agree & (angle > settings.usable_parallax) & (best.points.inverse_depth > 0) & ~over
-    left = _left(window, best, vague, visible, over, depth)
-    return left._replace(known=usable), Refined(covariance, best.points.X, spread, lever, usable)
+    left = _left(window, best, vague, visible, over)
+    return left._replace(known=usable), Refined(covariance, best.points.X, spread, lever, angle, usable)
 
 
 def _left(
@@ -225,7 +220,6 @@ def _left(
     vague: PointPrior,
     visible: Bool[Array, " n"],
     over: Bool[Array, " n"],
-    depth: Float[Array, ""],
 ) -> Window:
     """The window without what is over, and with room for the next keyframe.
 
@@ -251,8 +245,8 @@ def _left(
     order = jnp.where(index <= gone, jnp.roll(index, 1), index).at[0].set(gone)
     rows = (6 * order[:, None] + jnp.arange(6)).reshape(-1)
     information, pull = information[rows[:, None], rows], pull[rows]
-    information = information.at[:6, :6].add(jnp.where(leaving, _pinned(window, best.poses, depth)[gone], 0.0))
-    marginal = _without_first(information, pull)
+    others = jnp.broadcast_to(jnp.eye(6, dtype=pull.dtype), (k - 1, 6, 6))
+    marginal = _without_first(*_held(jnp.concatenate([best.free[gone][None], others]), information, pull))
     information, pull = (jnp.where(leaving, a, b) for a, b in zip(marginal, (information, pull), strict=True))
     mask = mask[order]
     return window._replace(
@@ -267,19 +261,39 @@ def _left(
     )
 
 
-def _pinned(window: Window, poses: SE3, depth: Float[Array, ""]) -> Float[Array, "k 6 6"]:
-    """The gauge, as information: the first pose of all, and the length of the base line to the second."""
-    dtype = window.pull.dtype
-    exact = jnp.asarray(GAUGE, dtype) ** -2
-    first = jnp.diag(exact * jnp.concatenate([jnp.full(3, 1.0, dtype) / depth**2, jnp.ones(3, dtype)]))
+def _free(window: Window, poses: SE3) -> Float[Array, "k 6 6"]:
+    """Projections on what the gauge leaves of the poses' errors.
 
-    def one(role: Array, pose: SE3) -> Array:
+    The first pose of all is exact, and so is the length of the base line to the second; empty places have no errors.
+    """
+    k, dtype = len(window.role), window.pull.dtype
+    all_, none = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
+
+    def one(role: Array, empty: Array, pose: SE3) -> Array:
         # exp(x) of a pose lengthens its base line by its part along it.
         between = relative(window.origin, pose).translation()
-        along = jnp.outer(between, between) * safe_divide(exact, (between @ between) ** 2)
-        return jnp.where(role == 1, first, jnp.where(role == 2, jnp.pad(along, (0, 3)), 0.0))
+        along = safe_divide(jnp.outer(between, between), between @ between)
+        second = all_ - jnp.pad(along, (0, 3))
+        return jnp.where(empty | (role == 1), none, jnp.where(role == 2, second, all_))
 
-    return jax.vmap(one)(window.role, poses)
+    return jax.vmap(one)(window.role, jnp.arange(k) < k - window.kept, poses)
+
+
+def _projected(free: Float[Array, "k 6 6"], A: Float[Array, "s s"]) -> Float[Array, "s s"]:
+    k = len(free)
+    return jnp.einsum("kab,kblc,lcd->kald", free, A.reshape(k, 6, k, 6), free).reshape(6 * k, 6 * k)
+
+
+def _held(
+    free: Float[Array, "k 6 6"], information: Float[Array, "s s"], pull: Float[Array, " s"]
+) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+    """Normal equations whose solution has no other errors than those that are `free`."""
+    k = len(free)
+    size = jnp.trace(information.reshape(k, 6, k, 6).diagonal(axis1=0, axis2=2)) / 6
+    # What is not free gets information of its own: as much as the rest of its pose, so that all stay of one scale.
+    rest = (jnp.eye(6, dtype=pull.dtype) - free) * jnp.where(size > 0, size, 1.0)[:, None, None]
+    pull = jnp.einsum("kab,kb->ka", free, pull.reshape(k, 6)).reshape(6 * k)
+    return _projected(free, information) + block_diagonal(rest), pull
 
 
 def _without_first(information: Float[Array, "s s"], pull: Float[Array, " s"]) -> tuple[Array, Array]:

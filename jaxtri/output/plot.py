@@ -15,7 +15,13 @@ from jaxtri.trajectory import Trajectory
 
 # Okabe & Ito's colours: told apart by everybody.
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
-SHADES = {"initialising": "#BBBBBB", "coasting": "#F0E442", "restarted": "#CC79A7", "lost": "#666666"}
+SHADES = {
+    "initialising": "#BBBBBB",
+    "coasting": "#F0E442",
+    "restarted": "#CC79A7",
+    "lost": "#666666",
+    "uncertain": "#E69F00",
+}
 MARKERS = ("^", "o", "s")
 NAMES = ("x (right)", "y (down)", "z (ahead)")
 GAP = 3.5  # median steps from which a line is broken: more than two frames are missing, however uneven the clock

@@ -18,6 +18,12 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
         f"{s['frames']} frames at {s['frames_per_second']:.0f} a second: {states}",
         f"{s['keyframes']} keyframes, {points}",
     ]
+    doubts = s["doubts"]
+    assert isinstance(doubts, dict)
+    if doubts:
+        frame, words = next(iter(doubts.items()))
+        more = f", the first of {len(doubts)}" if len(doubts) > 1 else ""
+        lines.append(f"frame {frame}{more}, is uncertain: {'; '.join(words)} (run.json has them all)")
     if s["scale_unknown_from_frame"] is not None:
         lines.append(f"the camera was lost: from frame {s['scale_unknown_from_frame']} on the scale is a guess")
     if s["interrupted"]:

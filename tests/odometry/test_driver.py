@@ -206,6 +206,41 @@ def test_frames_that_make_no_sense_are_coasted_over():
     assert errors(tracks, odometry).ate_percent < 2
 
 
+def test_a_skipped_frame_costs_neither_tracks_nor_accuracy():
+    """Exact pixels of a camera that turns by 16 degrees and moves by five steps where a frame is missing."""
+    t = np.arange(40)[:, None]
+    jump = (t >= 20) * 1.0
+    tracks = make(t * [0.03, 0.002, 0.004] + jump * [0.15, 0.0, 0.1], jump * [0.0, np.deg2rad(16), 0.0], noise_px=0.0)
+    assert tracks.visible[21].sum() > 40
+    odometry = Odometry(tracks.camera)
+    for k in range(40):
+        assert not odometry.add(tracks.pixels[k], tracks.visible[k], float(k)).any()
+    odometry.finish()
+    assert [p.status for p in odometry.poses] == [Status.TRACKING] * 40
+    estimate = odometry.trajectory().rotations
+    found = np.einsum("tji,tjk->tik", tracks.R[0] @ np.swapaxes(tracks.R, 1, 2), estimate)
+    angles = np.rad2deg(np.arccos(np.clip((np.trace(found, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert angles.max() < 0.004
+
+
+def test_frames_whose_numbers_do_not_hold_together_are_uncertain():
+    tracks = sideways(40)
+    pixels, visible = tracks.pixels.copy(), tracks.visible.copy()
+    rng = np.random.default_rng(0)
+    pixels[25] += rng.normal(scale=1.2, size=pixels[25].shape)  # three times the noise that is said
+    astray = np.flatnonzero(visible[30])[: int(0.6 * visible[30].sum())]
+    pixels[30, astray] = rng.uniform([0, 0], [640, 480], (len(astray), 2))
+    odometry = follow_tracks(tracks.camera, pixels, visible)
+    found = {k: p for k, p in enumerate(odometry.poses) if p.status is Status.UNCERTAIN}
+    assert found.keys() == {25, 30}
+    assert "their noise explains" in found[25].doubts[0]
+    assert f"{found[30].used} of {found[30].measured} points" in found[30].doubts[0]
+    assert all(not p.doubts for p in odometry.poses if p.status is Status.TRACKING)
+    good = [p for p in odometry.poses if p.status is Status.TRACKING]
+    assert max(p.rotation_sd_deg for p in good) < 1
+    assert min(p.parallax_deg for p in good[15:]) > 0.3
+
+
 def test_a_changing_number_of_features_never_recompiles():
     tracks = sideways(30)
     follow_tracks(tracks.camera, tracks.pixels, tracks.visible)

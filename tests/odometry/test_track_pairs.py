@@ -109,7 +109,7 @@ def test_errors_are_those_that_the_covariance_says(noisy):
         SE3(jnp.asarray(reports.pose.wxyz_xyz)), jax.tree.map(lambda x: x[1:], poses)
     )
     nees = np.einsum("ti,ti->t", errors, np.linalg.solve(reports.covariance, errors[..., None])[..., 0])
-    assert position_errors(scene, reports).max() < 0.02
+    assert position_errors(scene, reports).max() < 0.03
     # One run, whose frames share the errors of the first keyframes: no more than one independent frame.
     low, high = nees_interval(6, 1)
     assert low < np.mean(nees[SECOND:]) < high
@@ -198,7 +198,7 @@ def test_tracks_that_jump_are_given_up_and_the_pose_stays_right(noisy):
     _, reports = follow(scene)
     np.testing.assert_array_equal(np.flatnonzero(reports.drop[8]), jumpers)
     assert position_errors(scene, reports)[8] < 1.5 * position_errors(scene, clean)[8] + 2e-3
-    assert position_errors(scene, reports).max() < 0.02
+    assert position_errors(scene, reports).max() < 0.03
 
 
 def test_float32_stays_float32():
