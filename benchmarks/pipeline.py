@@ -2,17 +2,17 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/pipeline.py --data ../shared/data
 
-Decoding, optical flow forward and backward, filter and structure, end to end, writing nothing; 300 features, everything
+Decoding, optical flow forward and backward, filter and keyframes, end to end, writing nothing; 300 features, everything
 compiled before. `demo` is the command line's, at 640 x 480; in `restart` the camera is blind for 25 frames of it, so
 that it is lost and starts anew. `p99` and `max` are of the time between two poses, `filter` the share of it in which
 one is filtered; optical flow runs beside, in a thread of its own.
 
-Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 84 frames a second (p99 23 ms, slowest 29), blinded 111 (17,
-25; the grey frames cost little), 640 x 480 video 58 to 94, 752 x 480 71, KITTI 40; in another run 91, 96, 42 to 83,
-77, 44. The slowest frame of a video at 640 x 480 takes 22 to 24 ms, but 78 and 83 on Tsukuba and the rotation. 120
-frames a second, 30 ms and 5 % are asked. Optical flow takes 8 to 13 ms a frame at 640 x 480, the filter 2 to 9 beside
-it: together they want more than two cores, alone the filter takes 3 to 4. With a start that is waited for the slowest
-frames took 55 to 132 ms.
+Last answer (2 idle cores, JAX 0.10, OpenCV 5.0): demo 73 frames a second (p99 and slowest 30 ms), blinded 80 (26,
+34), 640 x 480 video 54 to 75, 752 x 480 96, KITTI 39. The slowest frame of a video at 640 x 480 takes 29 ms, but 58
+on Tsukuba and 144 on the rotation. Before keyframes were refined: 84, 111, 58 to 94, 71, 40; in another run 91, 96,
+42 to 83, 77, 44. 120 frames a second, 30 ms and 5 % are asked. Optical flow takes 9 to 15 ms a frame at 640 x 480,
+the filter 6 to 12 beside it, of which a keyframe is 10: together they want more than two cores. With a start that
+is waited for the slowest frames took 55 to 132 ms.
 """
 
 import tempfile

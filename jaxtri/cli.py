@@ -28,7 +28,7 @@ class Track:
     out: Path = Path("out")
     """Folder of the results."""
     base: str = "tracks"
-    """Base frames: `tracks` (a pair per track), `inherit` (one pair, restarts from tracked frames) or `paper`
+    """Base frames: `tracks` (a window of keyframes), `inherit` (one pair, restarts from tracked frames) or `paper`
     (one pair, restarts from consecutive frames)."""
     overlap: int = 1
     """Frames that two segments share (with `--base paper`)."""

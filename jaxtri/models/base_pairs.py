@@ -1,8 +1,8 @@
-"""The trifocal transfer with a base pair per track: every point has its own two base frames, already known.
+"""The trifocal transfer with base frames per track: every point has its own two, or more, already known.
 
-With the base poses fixed, the point that the pair fixes is constant, and the transfer to the current frame
-is the projection of that homogeneous point. What the noise of the two base observations does to the point is
-carried along as `spread`. The items are these points, so a frame costs O(N) with 12 error components.
+With the base poses fixed, the point that they fix is constant, and the transfer to the current frame is the
+projection of that homogeneous point. What the noise of the base observations does to the point is carried along as
+`spread`. The items are these points, so a frame costs O(N) with 12 error components.
 """
 
 from typing import ClassVar, NamedTuple

@@ -1,4 +1,4 @@
-"""The two ways to choose base frames, behind one interface for the driver: per track, or one pair for all."""
+"""The two ways to choose base frames, behind one interface for the driver: keyframes, or one pair for all."""
 
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -52,7 +52,7 @@ class Follower(Protocol):
 
 @dataclass
 class TrackPairs:
-    """A base pair per track: `jaxtri.track_pairs`."""
+    """Tracks measured from a window of keyframes: `jaxtri.track_pairs`."""
 
     settings: Settings
     state: track_pairs.State

@@ -86,7 +86,7 @@ class Recording(eqx.Module, Archived):
 # Compiled as a whole: operation by operation its gradient would take many minutes to compile.
 @partial(jax.jit, static_argnames="block")
 def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: int = 1) -> Report:
-    """The run of `jaxtri.track_pairs`, a base pair per track: reports of all frames after the first, (t - 1,)."""
+    """The run of `jaxtri.track_pairs`, from a window of keyframes: reports of all frames after the first, (t - 1,)."""
     u = recording.normalised(camera)
     view = recording.start(settings, u)
     ids, visible, second = recording.ids, recording.visible, recording.second[0]

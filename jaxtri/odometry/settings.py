@@ -20,8 +20,9 @@ class Base(Enum):
     """Which two base frames a track is measured from.
 
     Attributes:
-        TRACKS: A pair per track, drawn from keyframes. Overlapping tracks carry the scale, so nothing is handed over:
-            on real video this kind has the smallest error by far (`benchmarks/real_sequences.py`).
+        TRACKS: All keyframes of a window that see the track, improved together. Overlapping tracks carry the scale, so
+            nothing is handed over: on real video this kind has the smallest error by far
+            (`benchmarks/real_sequences.py`).
         INHERIT: One pair for all tracks. A new pair is made of two frames already tracked.
         PAPER: One pair for all tracks, as in Yu et al. 2006. A new pair is made of two consecutive frames, and its
             scale is that of the points which both pairs know.

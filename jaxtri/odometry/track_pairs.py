@@ -180,7 +180,7 @@ def step(
     hold: Bool[Array, ""] | bool = False,
     quality: Float[Array, "n 2"] | None = None,
 ) -> tuple[State, Report]:
-    """One frame: predict, update with the tracks that have a base pair, keep a keyframe when it is time.
+    """One frame: predict, update with the tracks whose points are known, keep a keyframe when it is time.
 
     `observed` are normalised points in slots, `visible` the slots that hold one, `fresh` those whose track
     begins here (whatever the slot held before is forgotten). With `hold` no keyframe is made. `quality` is what

@@ -9,6 +9,7 @@ from intervals import nees_interval
 from jaxlie import SE3, SO3
 from scipy.spatial.transform import Rotation
 
+from jaxtri.errors import InputError
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import compose, exp_pose, local, log_pose, multiply, relative, retract
@@ -199,6 +200,12 @@ def test_tracks_that_jump_are_given_up_and_the_pose_stays_right(noisy):
     np.testing.assert_array_equal(np.flatnonzero(reports.drop[8]), jumpers)
     assert position_errors(scene, reports)[8] < 1.5 * position_errors(scene, clean)[8] + 2e-3
     assert position_errors(scene, reports).max() < 0.03
+
+
+def test_a_window_needs_four_keyframes():
+    scene = Scene()
+    with pytest.raises(InputError, match="at least 4"):
+        track_pairs.init(SETTINGS, *(scene.frame(k)[0] for k in (0, 1)), jnp.ones(N, bool), scene.pose(1), keyframes=3)
 
 
 def test_float32_stays_float32():
