@@ -17,10 +17,10 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", (HERE.parent / "README.md").read_t
 # What each prints, and between which numbers what stands in the brackets must lie.
 PRINTED = {
     "calibration_gradient": [
-        (r"by focal: (\S+), by", 0.04, 0.07),
-        (r"by focal: .* differences (\S+)", 0.04, 0.07),
-        (r"by k1: (\S+), by", -0.8, -0.4),
-        (r"by k1: .* differences (\S+)", -0.8, -0.4),
+        (r"by focal: (\S+), by", 0.02, 0.04),
+        (r"by focal: .* differences (\S+)", 0.02, 0.04),
+        (r"by k1: (\S+), by", -0.4, -0.2),
+        (r"by k1: .* differences (\S+)", -0.4, -0.2),
     ],
     "live": [(r"tracking at .* one sigma (\S+)\n", 0.01, 0.3), (r"(\S+) base lines in 30 frames", 2, 3.5)],
     "own_tracks": [
