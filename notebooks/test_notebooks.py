@@ -19,4 +19,4 @@ if version("jaxlib").startswith("0.10."):  # compiles faster; an unknown flag wo
 @pytest.mark.filterwarnings("ignore")
 def test_runs(path):
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(HERE)}}).execute()
+    NotebookClient(notebook, timeout=1200, resources={"metadata": {"path": str(HERE)}}).execute()
