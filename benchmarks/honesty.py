@@ -133,7 +133,7 @@ def main() -> None:
     if args.plots:
         axes.axhline(6, color="k", lw=0.8)
         axes.set(xlabel="frame after the start", ylabel="NEES (6 is right)")
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
         with atomic_path(args.plots / "honesty.png") as temporary:
             figure.savefig(temporary, dpi=110)
     report(args.json, figures)

@@ -218,7 +218,9 @@ def step(
     depths = tracks.base.point[:, :3] @ belief.mean.pose.rotation().as_matrix()[2]
     depths = depths / jnp.where(jnp.abs(inverse) > FARTHEST, inverse, FARTHEST) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
-    plain = State(belief, tracks, state.window, state.covariance, sensitivity, state.seen, held, depth, found.coasted)
+    plain = state._replace(
+        belief=belief, tracks=tracks, sensitivity=sensitivity, held=held, depth=depth, coasted=found.coasted
+    )
     new = jax.lax.cond(keyframe, lambda: _rebase(settings, plain, observed, visible), lambda: plain)
     covariance = total(new.belief.covariance[:6, :6], new.covariance, new.sensitivity)
     status, said = judged(found.status, covariance, found.diagnostics), found.diagnostics
@@ -239,8 +241,7 @@ def _owed(
     scale = replace_masked(mask, scale, 1.0)
     zero, unmeasured = jnp.zeros(12, weights.dtype), jnp.zeros((len(mask), 2), weights.dtype)
     said = projective.linearise(model, mean, zero, items, unmeasured, mask, scale)
-    spread = jnp.moveaxis(jnp.where(mask[:, None, None], tracks.base.spread, 0.0), 0, -1)
-    each = said.coupling(weights, spread)
+    each = said.coupling(weights, items.spread.reshape(4, -1, len(mask)))
     lever = jnp.where(mask, tracks.lever, 0.0)
     A, _ = said.normal_equations(weights)
     return A, -each.reshape(6, -1) @ lever.reshape(len(lever), -1).T
