@@ -26,9 +26,8 @@ from jaxtri.estimation.bundle import (
     seen_from,
     solver,
 )
-from jaxtri.filters.linalg import linearised
 from jaxtri.geometry.epipolar import inverse_depth, parallax, safe_divide
-from jaxtri.geometry.pose import adjoint, identity, local, relative, retract
+from jaxtri.geometry.pose import adjoint, identity, inverse_left_jacobian, local, relative, retract
 from jaxtri.odometry.measuring import FARTHEST
 from jaxtri.odometry.settings import Settings
 
@@ -202,8 +201,12 @@ def _improved(
         poses = jax.vmap(retract)(best.poses, x.reshape(k, 6))
         return estimate(poses, best.points.moved(best.reduced.points(x)), best.damping * BETTER), None
 
-    begin = estimate(window.poses, points, jnp.asarray(DAMPING, dtype))
-    best, _ = jax.lax.scan(step, begin, None, length=steps)
+    # The first of them goes nowhere: equations that say nothing. So the estimate is compiled once, and so its gradient.
+    damping = jnp.asarray(DAMPING / BETTER, dtype)
+    shapes = jax.eval_shape(estimate, window.poses, points, damping)
+    begin = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    begin = begin._replace(poses=window.poses, points=points, information=jnp.eye(6 * k, dtype=dtype), damping=damping)
+    best, _ = jax.lax.scan(step, begin, None, length=steps + 1)
     covariance = solver(best.information)(jnp.eye(6 * k, dtype=dtype))
     covariance = _projected(best.free, (covariance + covariance.T) / 2)
     spread = jnp.einsum("qsn,tsn->qtn", best.points.basis, best.reduced.root) / settings.sigma
@@ -322,11 +325,8 @@ def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Arr
     Source: Huang, Mourikis & Roumeliotis 2010, for the filter.
     """
 
-    def one(a: SE3, b: SE3) -> tuple[Array, Array]:
-        return linearised(lambda e: local(a, retract(b, e)), jnp.zeros(6, window.pull.dtype))
-
-    x, each = jax.vmap(one)(window.poses, poses)
-    x, A = x.reshape(-1), block_diagonal(each)
+    each = jax.vmap(local)(window.poses, poses)
+    x, A = each.reshape(-1), block_diagonal(jax.vmap(inverse_left_jacobian)(each))
     before, now = _gauge(window.poses), _gauge(poses)
     size = jnp.sqrt(jnp.sum(now**2, axis=0))
     before, now = before / size, now / size

@@ -104,6 +104,13 @@ class TestPose:
             np.testing.assert_allclose(matrix, scipy.linalg.expm(twist), atol=1e-13)
 
     # jaxlie 1.5's own SE3.exp has twice the right derivative with respect to a small rotation.
+    @pytest.mark.parametrize("angle", [a for a in ANGLES if a <= 1])
+    def test_inverse_left_jacobian_is_the_derivative_of_the_logarithm(self, angle):
+        xi = jnp.concatenate([jnp.array([0.3, -2.0, 0.7]), angle * directions(1)[0]])
+        at = pose.exp_pose(xi)
+        slope = jax.jacfwd(lambda e: pose.log_pose(pose.retract(at, e)))(jnp.zeros(6))
+        np.testing.assert_allclose(pose.inverse_left_jacobian(xi), slope, atol=3e-12)
+
     def test_derivatives_of_exponential_logarithm_and_local(self):
         axis = jnp.asarray(directions(1)[0])
         rho = jnp.array([1.0, -2.0, 3.0])
