@@ -27,6 +27,7 @@ jax.config.update("jax_enable_x64", True)
 from jaxtri.formats import atomic_path, read_camera, read_tum  # noqa: E402
 from jaxtri.geometry.camera import Camera  # noqa: E402
 from jaxtri.geometry.pose import local  # noqa: E402
+from jaxtri.odometry.poses import FramePose  # noqa: E402
 from jaxtri.odometry.run import Run, track  # noqa: E402
 from jaxtri.synthetic.laboratory import laboratory  # noqa: E402
 from jaxtri.synthetic.scene import rendered_sequence  # noqa: E402
@@ -89,18 +90,36 @@ def rendered(camera: Camera, path: Path, seed: int) -> Iterator[Frame]:
         yield Frame(k, k / FPS, image)
 
 
-def squares(run: Run, T_world_camera: np.ndarray) -> np.ndarray:
-    """NEES of the frames after the start; of true poses (t, 4, 4), camera to world, one a frame of the run."""
-    first, second = run.odometry.base_pair or (0, 0)
+def squares(poses: list[FramePose], first: int, second: int, T_world_camera: np.ndarray) -> np.ndarray:
+    """NEES of the frames after the start; of true poses (t, 4, 4), camera to world, one a frame of the run.
+
+    The gauge is the pose of frame `first`, and the distance from there to frame `second`.
+    """
     true = np.linalg.inv(T_world_camera) @ T_world_camera[first]
-    true[:, :3, 3] /= np.linalg.norm(true[second, :3, 3])
+    begin, end = poses[first].T_camera_world, poses[second].T_camera_world
+    assert begin is not None
+    assert end is not None
+    true[:, :3, 3] *= np.linalg.norm((end @ np.linalg.inv(begin))[:3, 3]) / np.linalg.norm(true[second, :3, 3])
+    true = true @ begin  # in the world of the estimate
     error = jax.jit(lambda T, true: local(SE3.from_matrix(T), SE3.from_matrix(true)))
     found = []
-    for pose, T in zip(run.odometry.poses[second + 1 :], true[second + 1 :], strict=True):
-        if pose.T_camera_world is not None:
-            e = np.asarray(error(pose.T_camera_world, T))
-            found.append(e @ np.linalg.solve(np.asarray(pose.covariance), e))
+    for k in range(first + 1, len(poses)):
+        if k != second and poses[k].T_camera_world is not None:
+            e = np.asarray(error(poses[k].T_camera_world, true[k]))
+            found.append(e @ np.linalg.solve(np.asarray(poses[k].covariance), e))
     return np.array(found)
+
+
+def gauges(run: Run) -> dict[str, tuple[list[FramePose], int, int]]:
+    """The causal and the refined poses, each with the frames that their gauge is made of."""
+    first, second = run.odometry.base_pair or (0, 0)
+    kept = run.odometry.poses, first, second
+    assert run.refined is not None
+    positions = run.trajectory.positions[run.refined.keyframes]
+    farthest = run.refined.keyframes[
+        int(np.argmax(np.linalg.norm(positions - run.trajectory.positions[first], axis=1)))
+    ]
+    return {"": kept, "refined_": (run.refined.poses, first, farthest)}
 
 
 def main() -> None:
@@ -110,26 +129,30 @@ def main() -> None:
     camera = Camera.from_parameters(560, 560, 319.5, 239.5, width=640, height=480)
     for name, path in paths(frames, args.seed).items():
         if not args.quick or name == "hand_held":
-            runs[name] = track(rendered(camera, path, args.seed), camera, progress=False), poses(path)
+            runs[name] = track(rendered(camera, path, args.seed), camera, progress=False, refine=True), poses(path)
     for name in () if args.quick else EXACT:
         folder = args.data / name
         if folder.is_dir():
             truth = read_tum(folder / "groundtruth.txt")
             with open_source(folder) as source:
-                run = track(source, read_camera(folder / "camera.json"), progress=False)
+                run = track(source, read_camera(folder / "camera.json"), progress=False, refine=True)
             nearest = np.abs(truth.times[:, None] - run.trajectory.times).argmin(axis=0)
             runs[name] = run, truth.T_world_camera[nearest]
     figures, rows = {}, []
     figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
     for name, (run, T) in runs.items():
-        all_ = squares(run, T)
-        axes.semilogy(all_, label=name)
-        nees, coverage = float(np.mean(all_[::EVERY])), float(np.mean(all_[::EVERY] < REGION))
-        figures |= {f"{name}.nees": nees, f"{name}.coverage": coverage}
-        ate = evaluate(run.trajectory, Trajectory(run.trajectory.times, T)).ate_percent
-        row = [f"{nees:.2f}", f"{np.median(all_[::EVERY]):.2f}", f"{coverage:.2f}", f"{ate:.3f}"]
-        rows.append([name, len(T), *row, run.statistics["status"]])
-    print(table(["sequence", "frames", "NEES", "median", "in 95 %", "ATE %", "status"], rows))
+        row: list[object] = [name, len(T)]
+        for kind, gauge in gauges(run).items():
+            all_ = squares(*gauge, T)
+            axes.semilogy(all_, "--" if kind else "-", color=f"C{len(rows)}", label=None if kind else name)
+            nees, coverage = float(np.mean(all_[::EVERY])), float(np.mean(all_[::EVERY] < REGION))
+            figures |= {f"{name}.{kind}nees": nees, f"{name}.{kind}coverage": coverage}
+            found = run.trajectory if kind else run.odometry.trajectory()
+            ate = evaluate(found, Trajectory(found.times, T)).ate_percent
+            row += [f"{nees:.2f}", f"{np.median(all_[::EVERY]):.2f}", f"{coverage:.2f}", f"{ate:.3f}"]
+        rows.append([*row, run.statistics["status"]])
+    numbers = ["NEES", "median", "in 95 %", "ATE %"]
+    print(table(["sequence", "frames", *numbers, *(f"refined {x}" for x in numbers), "status"], rows))
     if args.plots:
         axes.axhline(6, color="k", lw=0.8)
         axes.set(xlabel="frame after the start", ylabel="NEES (6 is right)")

@@ -48,15 +48,17 @@ ROTATION = "rotation_7scenes_kitchen"
 ROTATION_PEERS = "orientation RMSE in degrees: pnp 1.50, window 1.61, isam2 1.54, svo .91 (92 %), full BA .34"
 
 
-def run_sequence(folder: Path, base: Base) -> tuple[Run, Evaluation, float]:
-    """The run, its errors, and the share of frames with a pose of the first scale."""
+def run_sequence(folder: Path, base: Base) -> tuple[Run, Evaluation, Evaluation | None, float]:
+    """The run, its errors, those once it is refined, and the share of frames with a pose of the first scale."""
     camera = read_camera(folder / "camera.json")
     with open_source(folder) as source:
-        run = track(source, camera, base=base, progress=False)
+        run = track(source, camera, base=base, progress=False, refine=base is Base.TRACKS)
     posed = np.array([p.T_camera_world is not None for p in run.odometry.poses])
     one_scale = len(posed) if run.odometry.scale_unknown_from is None else run.odometry.scale_unknown_from
     coverage = posed[:one_scale].sum() / len(posed)
-    return run, evaluate(run.trajectory, read_tum(folder / "groundtruth.txt")), float(coverage)
+    truth = read_tum(folder / "groundtruth.txt")
+    refined = None if run.refined is None else evaluate(run.trajectory, truth)
+    return run, evaluate(run.odometry.trajectory(), truth), refined, float(coverage)
 
 
 def plot(run: Run, folder: Path, path: Path) -> None:
@@ -108,13 +110,13 @@ def main() -> None:
         args.bases = ["tracks"]
     figures: dict[str, float] = {}
     for kind in args.bases:
-        rows, ratios = [], []
+        rows, ratios, refined_ratios = [], [], []
         prefix = "" if kind == "tracks" else f"{kind}."
         for folder in folders:
             name = folder.name
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                run, errors, coverage = run_sequence(folder, Base(kind))
+                run, errors, refined, coverage = run_sequence(folder, Base(kind))
             if args.plots:
                 plot(run, folder, args.plots / f"{kind}_{name}.png")
             fps = float(run.statistics["frames_per_second"])  # pyright: ignore[reportArgumentType]
@@ -128,6 +130,10 @@ def main() -> None:
                 f"{prefix}{name}.rpe_rotation_deg": errors.rpe_rotation_deg,
                 f"{prefix}{name}.fps": fps,
             }
+            if refined is not None:
+                names = ("ate_percent", "rotation_rmse_deg", "rpe_translation_percent", "rpe_rotation_deg")
+                figures |= {f"refined.{name}.{x}": getattr(refined, x) for x in names}
+                figures[f"refined.{name}.coverage"] = coverage
             row = [
                 name,
                 f"{coverage:.0%}",
@@ -140,9 +146,14 @@ def main() -> None:
             if name in PEERS:
                 ratio = errors.ate_percent / PEERS[name][1]
                 ratios.append(ratio)
-                row += [f"{ratio:.2f}", *(f"{p:g}" for p in PEERS[name])]
+                row += [f"{ratio:.2f}"]
+                if refined is not None:
+                    refined_ratios.append(refined.ate_percent / PEERS[name][1])
+                    row += [f"{refined.ate_percent:.4f}", f"{refined_ratios[-1]:.2f}"]
+                row += [f"{p:g}" for p in PEERS[name]]
             else:
-                row += [""] * (1 + len(NAMES))
+                row += [""] if refined is None else ["", f"{refined.rotation_rmse_deg:.2f} deg", ""]
+                row += [""] * len(NAMES)
             rows.append(row)
             print(f"  {kind}: {name} {errors.ate_percent:.3f} %", flush=True)
         head = [
@@ -157,11 +168,15 @@ def main() -> None:
             "fps",
             "ATE/pnp",
         ]
+        head += ["refined %", "/pnp"] if kind == "tracks" else []
         print(f"\nbase: {kind}\n" + table(head + list(NAMES), rows))
         if ratios:
             mean = float(np.exp(np.mean(np.log(ratios))))
             figures[f"{prefix}geomean_ate_vs_pnp"] = mean
             print(f"geometric mean of ATE / pnp over {len(ratios)} sequences: {mean:.3f}")
+        if refined_ratios:
+            figures["refined.geomean_ate_vs_pnp"] = float(np.exp(np.mean(np.log(refined_ratios))))
+            print(f"the same, refined: {figures['refined.geomean_ate_vs_pnp']:.3f}")
         print(f"{ROTATION}: {ROTATION_PEERS}\n", flush=True)
     circle = args.data / "tracks_oxford_dinosaur"
     if circle.is_dir():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxlie import SO3
 
-from jaxtri import Trifocal, ekf, refine, tuning
+from jaxtri import Trifocal, ekf, tuning, two_view
 from jaxtri.models.trifocal import start
 from jaxtri.synthetic import paper_experiment
 
@@ -14,7 +14,7 @@ jax.config.update("jax_enable_x64", True)
 truth = paper_experiment(jax.random.key(0), n_points=60, n_frames=40, phases=(2,))
 first, second, later = truth.observed[0], truth.observed[4], truth.observed[5:]
 guess = truth.translations[4], SO3.from_matrix(truth.rotations[4])
-view = refine(*guess, first, second, jnp.ones(60, bool), truth.sigma)
+view = two_view.refine(*guess, first, second, jnp.ones(60, bool), truth.sigma)
 belief = start(view, frames=4, velocity_sd=0.01, angular_velocity_sd=0.02)
 
 

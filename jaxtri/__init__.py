@@ -32,8 +32,9 @@ from jaxtri.errors import (
     UnitsWarning,
     VideoError,
 )
+from jaxtri.estimation import two_view
 from jaxtri.estimation.bound import filtering_bound, smoothing_bound
-from jaxtri.estimation.two_view import TwoView, refine
+from jaxtri.estimation.two_view import TwoView
 from jaxtri.filters import ekf, schmidt
 from jaxtri.filters.ekf import Belief, Diagnostics, Robust
 from jaxtri.filters.scan import batch
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from jaxtri.formats import read_camera, read_timestamps, read_trajectory, write_tum
     from jaxtri.odometry.driver import Odometry
     from jaxtri.odometry.poses import FramePose
+    from jaxtri.odometry.refine import Refinement, refine
     from jaxtri.odometry.run import Run, follow_tracks, track, warm_up
     from jaxtri.odometry.structure import Points
     from jaxtri.output.plot import plot_trajectory
@@ -71,6 +73,7 @@ _LATER = {
     "KLTSettings": "jaxtri.vision.klt",
     "Odometry": "jaxtri.odometry.driver",
     "Points": "jaxtri.odometry.structure",
+    "Refinement": "jaxtri.odometry.refine",
     "Run": "jaxtri.odometry.run",
     "follow_tracks": "jaxtri.odometry.run",
     "open_source": "jaxtri.vision.video",
@@ -78,6 +81,7 @@ _LATER = {
     "read_camera": "jaxtri.formats",
     "read_timestamps": "jaxtri.formats",
     "read_trajectory": "jaxtri.formats",
+    "refine": "jaxtri.odometry.refine",
     "track": "jaxtri.odometry.run",
     "tuning": "jaxtri.estimation",
     "warm_up": "jaxtri.odometry.run",
@@ -125,6 +129,7 @@ __all__ = [
     "PointNoise",
     "Points",
     "Recording",
+    "Refinement",
     "Report",
     "ResolutionChangeError",
     "Robust",
@@ -170,6 +175,7 @@ __all__ = [
     "track",
     "track_pairs",
     "tuning",
+    "two_view",
     "warm_up",
     "write_overlay",
     "write_results",

@@ -44,6 +44,8 @@ class Track:
     """Stop after so many frames."""
     place: tuple[float, float] | None = None
     """Where the car stands: pixel u v in the middle frame; on the dominant plane by default."""
+    refine: bool | None = None
+    """Adjust all keyframes together at the end: on for files, off for a camera."""
     overlay: bool = True
     """Write overlay.mp4."""
     recording: bool = False
@@ -131,7 +133,9 @@ def _track(options: Track) -> None:
         if live:
             warm_up(camera, **how)
         frames: Any = spool(source, options.out / "frames") if live else source
-        run = track(frames, camera, progress=not options.quiet, max_frames=options.max_frames, **how)
+        refine = not live if options.refine is None else options.refine
+        more = {"progress": not options.quiet, "max_frames": options.max_frames, "refine": refine}
+        run = track(frames, camera, **more, **how)
         fps = source.fps
     said = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
     paths = write_results(run, options.out, said)

@@ -21,9 +21,9 @@ from jaxtri import (
     Trifocal,
     ekf,
     follow_tracks,
-    refine,
     schmidt,
     tuning,
+    two_view,
 )
 from jaxtri.errors import CameraError, InputError, UnitsWarning
 from jaxtri.odometry.settings import Base
@@ -193,7 +193,7 @@ def test_noises_and_focal_lengths_are_positive(value):
     with pytest.raises(CameraError, match="fy is"):
         Camera.from_parameters(500, value, 320, 240)
     with pytest.raises(InputError, match="sigma is"):
-        refine(jnp.ones(3), SO3.identity(), jnp.zeros((9, 2)), jnp.zeros((9, 2)), jnp.ones(9, bool), value)
+        two_view.refine(jnp.ones(3), SO3.identity(), jnp.zeros((9, 2)), jnp.zeros((9, 2)), jnp.ones(9, bool), value)
 
 
 def test_settings_want_a_pass():

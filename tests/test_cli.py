@@ -15,7 +15,7 @@ from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.vision.video import write_video
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-FILES = ("trajectory.txt", "trajectory.png", "points.ply", "run.json", "overlay.mp4")
+FILES = ("trajectory.txt", "trajectory_causal.txt", "trajectory.png", "points.ply", "run.json", "overlay.mp4")
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,11 @@ def test_track_writes_everything_and_evaluate_reads_it(sequence, tmp_path, capsy
     assert run["settings"]["noise_px"] == 0.4
     assert run["settings"]["starts"] == "opencv"
     assert "jax" in run["versions"]
+    assert run["statistics"]["refined"]["parts"][0]["refined"]
+    assert run["statistics"]["refined"]["moved_percent_of_path"] < 0.5
+    causal = read_tum(out / "trajectory_causal.txt")
+    assert evaluate(estimate, truth).ate_percent < 0.1
+    assert 0 < np.abs(causal.positions - estimate.positions).max() < 0.01
     video = cv2.VideoCapture(str(out / "overlay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 24
     capsys.readouterr()

@@ -2,7 +2,9 @@
 
 A point is homogeneous, so that it may lie at infinity; its error has three components, in the axes of a camera that
 sees it: two of its image there and its inverse depth, which are as Gaussian as a point's errors get. Noise is that of
-an image point, `sigma`, robust by the weights of Geman and McClure.
+an image point, `sigma`, robust by the weights of Geman and McClure. A feature that is followed from frame to frame
+keeps much of its error: with a correlation it is that of the view before, times this, and something new (an
+autoregression of first order), and what is new is weighted.
 Source: Triggs et al. 2000, sections 6 and 8.
 """
 
@@ -15,6 +17,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
 from jaxtri.filters.linalg import linearised
+from jaxtri.geometry.epipolar import inverse_depth, parallax, safe_divide
 from jaxtri.geometry.pose import matrix, retract
 
 INFINITE = 1e-9  # depth, over that of the point's own coordinates, below which nothing is seen
@@ -26,10 +29,12 @@ class Views(NamedTuple):
     Attributes:
         observed: (2, k, n) normalised image points.
         mask: (k, n) which of them are seen.
+        correlation: Of a point's noise with that in the pose before, from 0 to below 1; None: there is none.
     """
 
     observed: Float[Array, "2 k n"]
     mask: Bool[Array, "k n"]
+    correlation: Float[Array, ""] | None = None
 
 
 class Points(NamedTuple):
@@ -73,33 +78,106 @@ def seen_from(
     return Points(X, basis)
 
 
-class Linearised(NamedTuple):
-    """All observations at one estimate: residuals and Jacobians, over sigma and weighted.
+class Looks(NamedTuple):
+    """The first and the last look at each point, and what these two make of it.
 
     Attributes:
-        residual: (k, 2, n) of the images.
-        pose: (k, 6, 2, n) their derivative with respect to the left perturbations of the poses.
+        R: (n, 3, 3) of the pose of the first one, world to camera.
+        T: (n, 3) the same.
+        u: (2, n) image there, normalised.
+        inverse_depth: (n,) there, by both looks; meaningless where there is but one.
+        angle: (n,) between their rays, radians; zero where there is but one.
+    """
+
+    R: Float[Array, "n 3 3"]
+    T: Float[Array, "n 3"]
+    u: Float[Array, "2 n"]
+    inverse_depth: Float[Array, " n"]
+    angle: Float[Array, " n"]
+
+
+def looks(poses: SE3, views: Views) -> Looks:
+    """Of all points."""
+    k, n = views.mask.shape
+    first, last = jnp.argmax(views.mask, axis=0), k - 1 - jnp.argmax(views.mask[::-1], axis=0)
+    R, T, column = jax.vmap(lambda p: matrix(p.rotation()))(poses), poses.translation(), jnp.arange(n)
+    u1, u2 = views.observed[:, first, column], views.observed[:, last, column]
+
+    def two(u1: Array, u2: Array, R1: Array, T1: Array, R2: Array, T2: Array) -> tuple[Array, Array]:
+        between = R2 @ R1.T
+        shift = T2 - between @ T1
+        return inverse_depth(u1, u2, between, shift, shift), parallax(u1, u2, between)
+
+    rho, angle = jax.vmap(two)(u1.T, u2.T, R[first], T[first], R[last], T[last])
+    return Looks(R[first], T[first], u1, rho, jnp.where(first < last, angle, 0.0))
+
+
+class Linearised(NamedTuple):
+    """All observations at one estimate: residuals and Jacobians, over sigma.
+
+    Attributes:
+        residual: (k, 2, n) of the images; zero where nothing is seen, and so are the others.
+        pose: (k, 6, 2, n) derivative of the images with respect to the left perturbations of the poses.
         point: (k, 3, 2, n) with respect to the errors of the points.
-        weights: (k, n).
+        kept: (k, n) how much of a residual is that of the view before: zero in a track's first view. None: nothing.
+        weights: (k, n) of what is new in them.
         cost: Robust cost of all of them.
     """
 
     residual: Float[Array, "k 2 n"]
     pose: Float[Array, "k 6 2 n"]
     point: Float[Array, "k 3 2 n"]
+    kept: Float[Array, "k n"] | None
     weights: Float[Array, "k n"]
     cost: Float[Array, ""]
+
+
+def _camera(pose: SE3) -> Float[Array, "3 4"]:
+    return jnp.concatenate([matrix(pose.rotation()), pose.translation()[:, None]], axis=1)
+
+
+class _Seen(NamedTuple):
+    """Residuals over sigma, of what is seen in front of its camera, and what they cost."""
+
+    residual: Float[Array, "k 2 n"]
+    image: Float[Array, "k 2 n"]
+    over: Float[Array, "k n"]  # one over depth and sigma
+    kept: Float[Array, "k n"] | None
+    root: Float[Array, "k n"]  # of the weights
+    cost: Float[Array, ""]
+
+
+def _seen(Z: Float[Array, "k 3 n"], views: Views, sigma: Float[Array, ""], scale: Float[Array, ""]) -> _Seen:
+    """Of points at Z in the cameras."""
+    seen = views.mask & (Z[:, 2] > INFINITE)
+    depth = jnp.where(seen, Z[:, 2], 1.0)
+    image = jnp.where(seen[:, None], Z[:, :2] / depth[:, None], 0.0)
+    residual = jnp.where(seen[:, None], jnp.moveaxis(views.observed, 0, 1) - image, 0.0) / sigma
+    if views.correlation is None:
+        kept, distance = None, jnp.sum(residual**2, axis=1)
+    else:
+        kept = jnp.where(seen & _before(seen), views.correlation, 0.0)
+        distance = jnp.sum((residual - kept[:, None] * _before(residual)) ** 2, axis=1) / (1 - kept**2)
+    root = jnp.where(seen, 1 / (1 + distance / scale), 0.0)
+    # What is seen, and would lie behind the camera, costs as much as any outlier.
+    costs = jnp.where(views.mask, jnp.where(seen, distance * root, scale), 0.0)
+    return _Seen(residual, image, jnp.where(seen, 1 / (depth * sigma), 0.0), kept, root, jnp.sum(costs))
+
+
+def cost(
+    poses: SE3, points: Points, views: Views, sigma: Float[Array, ""], scale: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Robust cost of all observations: squares, as far as they are inside `scale`."""
+    k, n = views.mask.shape
+    Z = (jax.vmap(_camera)(poses).reshape(3 * k, 4) @ points.X).reshape(k, 3, n)
+    return _seen(Z, views, sigma, scale).cost
 
 
 def linearise(poses: SE3, points: Points, views: Views, sigma: Float[Array, ""], scale: Float[Array, ""]) -> Linearised:
     """Of all observations; `scale` is that of the robust weights: at this squared distance one counts a quarter."""
 
     def at(pose: SE3) -> tuple[Array, Array]:
-        def camera(error: Array) -> Array:
-            moved = retract(pose, error)
-            return jnp.concatenate([matrix(moved.rotation()), moved.translation()[:, None]], axis=1)
-
-        return linearised(camera, jnp.zeros(6, sigma.dtype))
+        return linearised(lambda error: _camera(retract(pose, error)), jnp.zeros(6, sigma.dtype))
 
     k, n = views.mask.shape
     # Between barriers: what is fused into its readers is worked out again for each of them.
@@ -107,18 +185,58 @@ def linearise(poses: SE3, points: Points, views: Views, sigma: Float[Array, ""],
     Z = (M.reshape(3 * k, 4) @ points.X).reshape(k, 3, n)
     dZ_pose = (jnp.moveaxis(slope, 3, 1).reshape(18 * k, 4) @ points.X).reshape(k, 6, 3, n)
     dZ_point = (M.reshape(3 * k, 4) @ points.basis.reshape(4, 3 * n)).reshape(k, 3, 3, n).swapaxes(1, 2)
-    seen = views.mask & (Z[:, 2] > INFINITE)
-    depth = jnp.where(seen, Z[:, 2], 1.0)
-    image = jnp.where(seen[:, None], Z[:, :2] / depth[:, None], 0.0)
-    residual = jnp.where(seen[:, None], jnp.moveaxis(views.observed, 0, 1) - image, 0.0) / sigma
-    distance = jnp.sum(residual**2, axis=1)
-    root = jnp.where(seen, 1 / (1 + distance / scale), 0.0)
-    over = (root / depth / sigma)[:, None, None]
-    pose = (dZ_pose[:, :, :2] - image[:, None] * dZ_pose[:, :, 2:]) * over
-    point = (dZ_point[:, :, :2] - image[:, None] * dZ_point[:, :, 2:]) * over
-    # What is seen, and would lie behind the camera, costs as much as any outlier.
-    costs = jnp.where(views.mask, jnp.where(seen, distance * root, scale), 0.0)
-    return jax.lax.optimization_barrier(Linearised(residual * root[:, None], pose, point, root**2, jnp.sum(costs)))
+    found = _seen(Z, views, sigma, scale)
+    image, over = found.image[:, None], found.over[:, None, None]
+    pose = (dZ_pose[:, :, :2] - image * dZ_pose[:, :, 2:]) * over
+    point = (dZ_point[:, :, :2] - image * dZ_point[:, :, 2:]) * over
+    return jax.lax.optimization_barrier(Linearised(found.residual, pose, point, found.kept, found.root**2, found.cost))
+
+
+def _before(x: Array) -> Array:
+    """Of each view what is in the view before it; zero in the first."""
+    return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
+
+
+class Precision(NamedTuple):
+    """Inverse covariances of the tracks' residuals, tridiagonal: a view's own, and what it has with that before."""
+
+    own: Float[Array, "k n"]
+    shared: Float[Array, "k n"] | None
+
+    @classmethod
+    def of(cls, said: Linearised, mask: Bool[Array, "k n"] | None = None) -> "Precision":
+        """Of what is new in the observations in `mask`."""
+        weights = said.weights if mask is None else jnp.where(mask, said.weights, 0.0)
+        if said.kept is None:
+            return cls(weights, None)
+        new = weights / (1 - said.kept**2)
+        own = new + jnp.concatenate([(new * said.kept**2)[1:], jnp.zeros_like(new[:1])])
+        return cls(own, -new * said.kept)
+
+    def __matmul__(self, x: Float[Array, "k *c n"]) -> Float[Array, "k *c n"]:
+        def wide(y: Array) -> Array:
+            return y.reshape(y.shape[0], *(1,) * (x.ndim - 2), y.shape[1])
+
+        if self.shared is None:
+            return wide(self.own) * x
+        shared = wide(self.shared)
+        after = jnp.concatenate([shared[1:] * x[1:], jnp.zeros_like(x[:1])])
+        return wide(self.own) * x + shared * _before(x) + after
+
+    def of_poses(self, pose: Float[Array, "k 6 2 n"]) -> Float[Array, "s s"]:
+        """What the residuals say of the poses, the points given."""
+        k, n = self.own.shape
+        each = pose.reshape(k, 6, 2 * n)
+
+        def products(weights: Array, others: Array) -> Array:
+            heavy = (pose[-len(weights) :] * weights[:, None, None]).reshape(len(weights), 6, 2 * n)
+            return jnp.einsum("kem,kfm->kef", heavy, others)
+
+        U = block_diagonal(products(self.own, each))
+        if self.shared is None:
+            return U
+        below = jnp.pad(block_diagonal(products(self.shared[1:], each[:-1])), ((6, 0), (0, 6)))
+        return U + below + below.T
 
 
 class Reduced(NamedTuple):
@@ -151,27 +269,72 @@ class PointPrior(NamedTuple):
     sd: Float[Array, " n"]
 
 
-def reduce(said: Linearised, points: Points, prior: PointPrior, mask: Bool[Array, "k n"] | None = None) -> Reduced:
-    """The points eliminated (Schur's complement), of the observations in `mask`."""
-    residual, pose, point = said.residual, said.pose, said.point
-    if mask is not None:
-        residual = jnp.where(mask[:, None], residual, 0.0)
-        pose, point = (jnp.where(mask[:, None, None], x, 0.0) for x in (pose, point))
+def reduce(
+    said: Linearised,
+    points: Points,
+    prior: PointPrior,
+    mask: Bool[Array, "k n"] | None = None,
+    *,
+    damping: Float[Array, ""] | float = 0.0,
+) -> Reduced:
+    """The points eliminated (Schur's complement), of what is new in the observations in `mask`.
+
+    The diagonal of what is said of each point is raised by the share `damping`.
+    """
+    pose, point = said.pose, said.point
     k, _, _, n = pose.shape
+    precision = Precision.of(said, mask)
+    heavy, left = jax.lax.optimization_barrier((precision @ point, precision @ said.residual))
+    root, offset = _points(point, heavy, left, points, prior, damping)
+    # The root first, on the points' side: a third of the sums.
+    rooted = jax.lax.optimization_barrier(jnp.einsum("tsn,ksan->ktan", root, heavy))
+    cross = jnp.sum(pose[:, :, None] * rooted[:, None], axis=3).reshape(6 * k, 3, n)
+    flat = cross.reshape(6 * k, 3 * n)
+    direct = jnp.einsum("kem,km->ke", pose.reshape(k, 6, 2 * n), left.reshape(k, 2 * n)).reshape(6 * k)
+    information = precision.of_poses(pose) - flat @ flat.T
+    return Reduced(information, direct - flat @ offset.reshape(-1), root, cross, offset)
+
+
+def _points(
+    point: Float[Array, "k 3 2 n"],
+    heavy: Float[Array, "k 3 2 n"],
+    left: Float[Array, "k 2 n"],
+    points: Points,
+    prior: PointPrior,
+    damping: Float[Array, ""] | float,
+) -> tuple[Float[Array, "3 3 n"], Float[Array, "3 n"]]:
+    """The root and the offset of a `Reduced`; `heavy` and `left` are the derivatives and residuals times precision."""
     known = prior.sd**-2
-    V = jnp.sum(point[:, :, None] * point[:, None], axis=(0, 3)).at[2, 2].add(known)
+    V = jnp.sum(heavy[:, :, None] * point[:, None], axis=(0, 3)).at[2, 2].add(known)
+    V = V * (1 + damping * jnp.eye(3, dtype=V.dtype))[..., None]
     # A point that nothing sees: any root will do.
     V = V + jnp.where(V[0, 0] > 0, 0.0, 1.0) * jnp.eye(3, dtype=V.dtype)[..., None]
-    b = jnp.sum(point * residual[:, None], axis=(0, 2)).at[2].add(known * (prior.mean - points.inverse_depth))
+    b = jnp.sum(point * left[:, None], axis=(0, 2)).at[2].add(known * (prior.mean - points.inverse_depth))
     root, b = jax.lax.optimization_barrier((_inverse_root(V), b))
-    offset = jnp.sum(root * b, axis=1)
-    # The root first, on the points' side: a third of the sums.
-    rooted = jax.lax.optimization_barrier(jnp.einsum("tsn,ksan->ktan", root, point))
-    cross = jnp.sum(pose[:, :, None] * rooted[:, None], axis=3).reshape(6 * k, 3, n)
-    flat, each = cross.reshape(6 * k, 3 * n), pose.reshape(k, 6, 2 * n)
-    U = jnp.einsum("kem,kfm->kef", each, each)
-    direct = jnp.einsum("kem,km->ke", each, residual.reshape(k, 2 * n)).reshape(6 * k)
-    return Reduced(block_diagonal(U) - flat @ flat.T, direct - flat @ offset.reshape(-1), root, cross, offset)
+    return root, jnp.sum(root * b, axis=1)
+
+
+def points_given(
+    said: Linearised,
+    points: Points,
+    prior: PointPrior,
+    step: Float[Array, "k 6"],
+    damping: Float[Array, ""] | float = 0.0,
+) -> Float[Array, "3 n"]:
+    """The errors of the points that are best once those of the poses are given, as `Reduced.points` has them."""
+    precision = Precision.of(said)
+    moved = said.residual - jnp.einsum("kean,ke->kan", said.pose, step)
+    root, offset = _points(said.point, precision @ said.point, precision @ moved, points, prior, damping)
+    return jnp.einsum("tsn,tn->sn", root, offset)
+
+
+def without_length(between: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """Projection on the errors of a pose that leave the length of its base line, `between`, as it is.
+
+    In camera axes: exp(x) of a pose lengthens its base line by its part along it.
+    """
+    along = safe_divide(jnp.outer(between, between), between @ between)
+    return jnp.eye(6, dtype=between.dtype) - jnp.pad(along, (0, 3))
 
 
 def block_diagonal(each: Float[Array, "k e e"]) -> Float[Array, "s s"]:

@@ -29,7 +29,7 @@ from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
 from jaxtri.odometry.slots import Slotted, slotted
 from jaxtri.odometry.start import BasePair, Observations, fill, find, hold
-from jaxtri.odometry.structure import Points, no_points
+from jaxtri.odometry.structure import Points, keep, no_points
 from jaxtri.trajectory import Trajectory
 
 CATCH_UP = 2  # frames taken in for each that comes, where some came while a start was worked out
@@ -65,7 +65,7 @@ class Odometry(Archived):
         base: Which two base frames a track is measured from; a `Base` or its name.
         start: When a base pair is good enough; `StartSettings.of(base)` by default.
         frame_time: Seconds of one frame, the unit of time of the filters; the first interval by default.
-        record: Keep the tracks, for `recording`.
+        record: Keep the tracks, for `recording` and `jaxtri.refine`.
         capacity: Most tracks that are followed at once; by default the least of 64, 128, 256, ... that holds the rows
             of the first frame. Filters are compiled once for each.
         poses: One `FramePose` a frame.
@@ -197,10 +197,10 @@ class Odometry(Archived):
         """The points of all tracks so far, in the world frame, each as it was last known."""
         self.finish()
         if self._follower is not None:
-            _keep(self._points, self._follower.ended())
+            keep(self._points, self._follower.ended())
         known = self._points.copy()
         if self._follower is not None:
-            _keep(known, self._follower.present())
+            keep(known, self._follower.present())
         if not known:
             return no_points()
         ids = np.array(sorted(known))
@@ -217,9 +217,14 @@ class Odometry(Archived):
         self.finish()
         if not self._recorder.pairs:
             raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
-        begun = self._follower.begun if self._recorder.on and self._follower is not None else []
+        begun = self._follower.begun if self._recorder.lost is None and self._follower is not None else []
         inherit = self.base is Base.INHERIT
         return self._recorder.recording(begun, self._dt, inherit=inherit, dtype=self._settings.sigma.dtype)
+
+    @property
+    def tracks(self) -> list[Slotted]:
+        """The tracks of all frames so far, where `record` is on."""
+        return self._recorder.tracks
 
     def _observe(
         self,
@@ -386,14 +391,7 @@ class Odometry(Archived):
             self.poses[queued.index].status = Status.LOST
         self._depth = self._follower.depth
         for points in (self._follower.ended(), self._follower.present()):
-            _keep(self._points, points)
+            keep(self._points, points)
         self._follower = None
         self._waiting, self._tried = [frame], (-1, 0.0)
         self.reason = "too few points agreed with any motion"
-
-
-def _keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> None:
-    # A track that two segments share is kept as the more exact of the two knows it.
-    for i, x, c in zip(*points, strict=True):
-        if int(i) not in known or np.trace(c) < np.trace(known[int(i)][1]):
-            known[int(i)] = (x, c)

@@ -15,17 +15,19 @@ from jaxtri.odometry.start import BasePair
 
 @dataclass
 class Recorder:
-    """The tracks of a run up to where the camera is lost, and its base pairs.
+    """The tracks of a run, and its base pairs up to where the camera is lost.
 
     Attributes:
         on: Tracks are kept.
         tracks: Of all frames so far, in slots.
         pairs: Base pairs of the segments: the first, and once the camera is lost those that followed it.
+        lost: Frame in which the camera was lost first; None before.
     """
 
     on: bool
     tracks: list[Slotted] = field(default_factory=list)
     pairs: list[BasePair] = field(default_factory=list)
+    lost: int | None = None
 
     def take(self, tracks: Slotted) -> None:
         """The next frame."""
@@ -34,15 +36,14 @@ class Recorder:
 
     def stop(self, frame: int, begun: list[BasePair]) -> None:
         """The camera is lost in this frame; `begun` are the base pairs since the first."""
-        if self.on:
-            del self.tracks[frame + 1 :]
-            self.pairs = [*self.pairs, *begun]
-        self.on = False
+        if self.lost is None:
+            self.pairs, self.lost = [*self.pairs, *begun], frame
 
     def recording(self, begun: list[BasePair], dt: Callable[[int], float], *, inherit: bool, dtype: Any) -> Recording:
         """All of it as arrays; `begun` are base pairs that are not in `pairs` yet, `dt` that of a frame."""
         pairs = [*self.pairs, *begun]
-        origin, kept = pairs[0].first, self.tracks[pairs[0].first :]
+        end = len(self.tracks) if self.lost is None else self.lost + 1
+        origin, kept = pairs[0].first, self.tracks[pairs[0].first : end]
         ends = [*(p.last for p in pairs[1:]), origin + len(kept) - 1]
         measured = [np.arange(p.second + 1, end + 1) - origin for p, end in zip(pairs, ends, strict=True)]
         frames = np.full((len(pairs), max(1, *map(len, measured))), -1)

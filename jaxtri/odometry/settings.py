@@ -73,6 +73,10 @@ class Settings(eqx.Module):
         sigma: Standard deviation of an image point in normalised image units: noise_px / focal length. 0.4 px by
             default: what fits the feature tracker of `jaxtri.vision` on real video (0.3 to 0.5 px). Lower, for rendered
             footage or better tracks, makes covariances smaller and more points fail the gate.
+        correlation: Correlation of a track's noise in a keyframe with that in the keyframe before, from 0 to below 1
+            (`jaxtri.refine`). A feature that is followed from frame to frame drifts: 0.9 by default, which fits the
+            feature tracker of `jaxtri.vision` on real video. 0 is noise drawn anew in every frame: features that are
+            found in each, and matched.
         acceleration: Standard deviation of the camera's acceleration, in median scene depths per frame^2. Higher trusts
             the prediction less: it survives jerks and smooths less.
         angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2. Higher and lower do
@@ -106,6 +110,7 @@ class Settings(eqx.Module):
     """
 
     sigma: Float[Array, ""] = eqx.field(converter=number)
+    correlation: Float[Array, ""] = eqx.field(converter=number)
     acceleration: Float[Array, ""] = eqx.field(converter=number)
     angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
     keyframe_flow: Float[Array, ""] = eqx.field(converter=number)
@@ -140,6 +145,7 @@ class Settings(eqx.Module):
 
         return cls(
             sigma=noise_px / focal,
+            correlation=scalar(0.9),
             acceleration=scalar(0.2),
             angular_acceleration=scalar(0.2),
             keyframe_flow=0.026 * width / focal,

@@ -37,8 +37,15 @@ def no_points() -> Points:
     return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
+def keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> None:
+    """Put points among those that are known: one that is there already stays as it is known better."""
+    for i, x, c in zip(*points, strict=True):
+        if int(i) not in known or np.trace(c) < np.trace(known[int(i)][1]):
+            known[int(i)] = (x, c)
+
+
 @jax.jit
-def _world_points(bank: Bank | BasePoint, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
+def world_points(bank: Bank | BasePoint, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
     """World points (n, 3) of a bank, the covariance of each, and which of them are known well enough to be shown."""
     if isinstance(bank, BasePoint):
         points, covariance = bank.point, settings.sigma**2 * bank.spread @ bank.spread.swapaxes(1, 2)
@@ -67,7 +74,7 @@ class Structure:
 
     def of(self, bank: Bank | BasePoint, good: np.ndarray, ids: np.ndarray) -> Points:
         """The known points of the `good` slots."""
-        xyz, covariance, known = (np.asarray(x) for x in _world_points(bank, self.settings))
+        xyz, covariance, known = (np.asarray(x) for x in world_points(bank, self.settings))
         good = good & known & np.isfinite(xyz).all(axis=1)
         return Points(ids[good], xyz[good], covariance[good])
 

@@ -22,11 +22,12 @@ from jaxtri.estimation.bundle import (
     Views,
     block_diagonal,
     linearise,
+    looks,
     reduce,
     seen_from,
     solver,
+    without_length,
 )
-from jaxtri.geometry.epipolar import inverse_depth, parallax, safe_divide
 from jaxtri.geometry.pose import adjoint, identity, inverse_left_jacobian, local, relative, retract
 from jaxtri.odometry.measuring import FARTHEST
 from jaxtri.odometry.settings import Settings
@@ -273,10 +274,7 @@ def _free(window: Window, poses: SE3) -> Float[Array, "k 6 6"]:
     all_, none = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
 
     def one(role: Array, empty: Array, pose: SE3) -> Array:
-        # exp(x) of a pose lengthens its base line by its part along it.
-        between = relative(window.origin, pose).translation()
-        along = safe_divide(jnp.outer(between, between), between @ between)
-        second = all_ - jnp.pad(along, (0, 3))
+        second = without_length(relative(window.origin, pose).translation())
         return jnp.where(empty | (role == 1), none, jnp.where(role == 2, second, all_))
 
     return jax.vmap(one)(window.role, jnp.arange(k) < k - window.kept, poses)
@@ -336,22 +334,11 @@ def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Arr
 
 def _begun(window: Window, depth: Float[Array, ""]) -> tuple[Points, Float[Array, " n"]]:
     """The points as they are known, or from the first and the newest look; the angle between these two in radians."""
-    mask = window.mask
-    k, n = mask.shape
-    first, last, column = jnp.argmax(mask, axis=0), k - 1 - jnp.argmax(mask[::-1], axis=0), jnp.arange(n)
-    R, T = jax.vmap(lambda p: p.rotation().as_matrix())(window.poses), window.poses.translation()
-    u1, u2 = window.observed[:, first, column], window.observed[:, last, column]
-
-    def two_looks(u1: Array, u2: Array, R1: Array, T1: Array, R2: Array, T2: Array) -> tuple[Array, Array]:
-        between = R2 @ R1.T
-        shift = T2 - between @ T1
-        return inverse_depth(u1, u2, between, shift, shift), parallax(u1, u2, between)
-
-    rho, angle = jax.vmap(two_looks)(u1.T, u2.T, R[first], T[first], R[last], T[last])
-    rho = jnp.clip(rho, FAREST / depth, NEAREST / depth)
+    first = looks(window.poses, Views(window.observed, window.mask))
+    rho = jnp.clip(first.inverse_depth, FAREST / depth, NEAREST / depth)
     # As known: the same point, in the axes of the first camera that still sees it.
-    camera = jnp.einsum("nij,jn->in", R[first], window.X[:3]) + T[first].T * window.X[3]
+    camera = jnp.einsum("nij,jn->in", first.R, window.X[:3]) + first.T.T * window.X[3]
     ahead = window.known & (camera[2] > FARTHEST)
     z = jnp.where(ahead, camera[2], 1.0)
-    u, rho = jnp.where(ahead, camera[:2] / z, u1), jnp.where(ahead, window.X[3] / z, rho)
-    return seen_from(R[first], T[first], u, rho), jnp.where(first < last, angle, 0.0)
+    u, rho = jnp.where(ahead, camera[:2] / z, first.u), jnp.where(ahead, window.X[3] / z, rho)
+    return seen_from(first.R, first.T, u, rho), first.angle

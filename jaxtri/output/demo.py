@@ -36,7 +36,7 @@ def demo(out: Path, said: Mapping[str, object], *, frames: int = 100, seed: int 
         ready.result()
     truth = read_tum(folder / "groundtruth.txt")
     with open_source(folder) as source:
-        run = track(source, camera, progress=progress)
+        run = track(source, camera, progress=progress, refine=True)
         fps = source.fps
     errors = evaluate(run.trajectory, truth)
     run = run.scaled(errors.scale)  # the gauge is known here: metres

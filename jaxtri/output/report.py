@@ -24,6 +24,14 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
         frame, words = next(iter(doubts.items()))
         more = f", the first of {len(doubts)}" if len(doubts) > 1 else ""
         lines.append(f"frame {frame}{more}, is uncertain: {'; '.join(words)} (run.json has them all)")
+    refined = s["refined"]
+    if isinstance(refined, dict):
+        seconds = s["seconds"]
+        assert isinstance(seconds, dict)
+        lines.append(
+            f"refined by {refined['keyframes']} frames at once in {seconds['refinement']:.1f} s: moved by "
+            f"{refined['moved_percent_of_path']:.2g} % of the path and {refined['turned_deg']:.2g} degrees"
+        )
     if s["scale_unknown_from_frame"] is not None:
         lines.append(f"the camera was lost: from frame {s['scale_unknown_from_frame']} on the scale is a guess")
     if s["interrupted"]:

@@ -32,6 +32,7 @@ def write_results(
 ) -> list[Path]:
     """Write trajectory.txt, trajectory.png, points.ply and run.json; returns their paths.
 
+    Where the run was refined, trajectory_causal.txt beside them has what the filter made of each frame at its time.
     `reference` is the truth in the frame and scale of the run, for the plot.
     """
     paths = [out / name for name in ("trajectory.txt", "trajectory.png", "points.ply", "run.json")]
@@ -42,6 +43,9 @@ def write_results(
     ]
     header = "timestamp tx ty tz qx qy qz qw   camera to world, camera x right y down z forward, scale: gauge"
     write_tum(paths[0], run.trajectory, "\n".join([header, *unsure]))
+    if run.refined is not None:
+        paths.insert(1, out / "trajectory_causal.txt")
+        write_tum(paths[1], run.odometry.trajectory(), header)
     figure = plot_trajectory(
         run.trajectory,
         reference=reference,
@@ -49,11 +53,11 @@ def write_results(
         names=NAMES,
         units="first base line" if reference is None else "m",
     )
-    with atomic_path(paths[1]) as temporary:
+    with atomic_path(out / "trajectory.png") as temporary:
         figure.savefig(temporary, dpi=120)
     sd = np.sqrt(np.linalg.eigvalsh(run.points.covariance)[:, -1]) if len(run.points.ids) else np.zeros(0)
-    write_ply(paths[2], run.points.xyz, run.colours, {"sd": sd})
-    write_json(paths[3], {"settings": settings, "versions": versions(), "statistics": run.statistics})
+    write_ply(out / "points.ply", run.points.xyz, run.colours, {"sd": sd})
+    write_json(out / "run.json", {"settings": settings, "versions": versions(), "statistics": run.statistics})
     return paths
 
 
@@ -83,15 +87,15 @@ def write_overlay(
     good = precise(run)
     if good.sum() < 10:
         raise InputError(f"only {int(good.sum())} points are known well enough to stand anything on")
-    posed = [k for k, p in enumerate(run.odometry.poses) if p.T_camera_world is not None]
+    posed = [k for k, p in enumerate(run.poses) if p.T_camera_world is not None]
     middle = posed[len(posed) // 2]
     T_world_car = place(run.points.xyz[good], run.trajectory.T_world_camera[middle], camera, pixel=at)
     wireframe = car()
 
     def drawn() -> Iterator[np.ndarray]:
-        total = len(run.odometry.poses)
+        total = len(run.poses)
         bar = tqdm(frames, total=total, unit="frame", desc="overlay", disable=None if progress else True, leave=False)
-        for frame, pose in zip(bar, run.odometry.poses, strict=False):
+        for frame, pose in zip(bar, run.poses, strict=False):
             image = frame.image
             if pose.T_camera_world is not None:
                 image = draw_wireframe(image, camera, pose.T_camera_world, T_world_car, wireframe)

@@ -1,0 +1,373 @@
+"""All keyframes of a sequence, and all points seen from them, at once: bundle adjustment of any length.
+
+Keyframes stand in blocks. A chunk of tracks are those that begin in one block and are followed to the end of the next:
+so what a chunk says concerns two blocks in a row, the normal equations of the poses are block tridiagonal, and time and
+memory grow with the length of the sequence alone. Chunks are worked out one after the other. Most tracks are short, and
+in a large block they would be mostly empty places: so there are several layers of chunks, of smaller and larger blocks,
+and each track is in the first that holds it. In the last one tracks are cut.
+Source: Triggs et al. 2000, sections 6 and 7.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtri.estimation.bundle import (
+    Linearised,
+    PointPrior,
+    Points,
+    Reduced,
+    Views,
+    cost,
+    linearise,
+    points_given,
+    reduce,
+    without_length,
+)
+from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
+from jaxtri.geometry.epipolar import safe_divide, safe_norm
+from jaxtri.geometry.pose import compose, multiply, relative, retract
+
+DAMPING, BETTER, WORSE = 1e-3, 0.1, 10.0  # of the equations of a step: at first, and after a step that is taken or not
+TOLERANCE = 0.05  # standard deviations
+MOST = 200  # steps of conjugate gradients; some ten are usual
+LEAST, HOPELESS = 1e-9, 1e6  # damping: no less; from here on no step can lower the cost
+
+
+class Layer(NamedTuple):
+    """Chunks of tracks: c of them, n tracks each, a chunk from 2 b keyframes, beginning every b.
+
+    Attributes:
+        observed: (c, 2, 2 b, n) normalised image points.
+        mask: (c, 2 b, n) which of them are seen.
+        prior: Of the inverse depths, (c, n) each.
+    """
+
+    observed: Float[Array, "c 2 v n"]
+    mask: Bool[Array, "c v n"]
+    prior: PointPrior
+
+    @property
+    def size(self) -> int:
+        """Keyframes in a block."""
+        return self.mask.shape[1] // 2
+
+
+class Batch(NamedTuple):
+    """What is seen from k keyframes.
+
+    Attributes:
+        layers: Blocks of each are several of the one before; k is (c + 1) b in all of them.
+        present: (k,) places that a keyframe stands in; the first one does, and its pose is given.
+        farthest: Keyframe whose distance from the first is given: the unit of length.
+    """
+
+    layers: tuple[Layer, ...]
+    present: Bool[Array, " k"]
+    farthest: Int[Array, ""]
+
+
+class Noise(NamedTuple):
+    """What is assumed of the image points.
+
+    Attributes:
+        sigma: Standard deviation in normalised image units.
+        scale: Of the robust weights: what is new in a point counts a quarter at this squared distance, over sigma.
+        correlation: Of a track's noise in one keyframe with that in the next.
+    """
+
+    sigma: Float[Array, ""]
+    scale: Float[Array, ""]
+    correlation: Float[Array, ""]
+
+
+class Estimate(NamedTuple):
+    """Poses and points, on their way to the least robust cost.
+
+    Attributes:
+        poses: (k,) world to camera.
+        points: Of each layer: (c, 4, n) and (c, 4, 3, n).
+        cost: Robust squares of what is new in all observations.
+        damping: Of the next step.
+        steps: How many were tried.
+        converged: Whether the last one moved the poses by less than the tolerance.
+    """
+
+    poses: SE3
+    points: tuple[Points, ...]
+    cost: Float[Array, ""]
+    damping: Float[Array, ""]
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+    @classmethod
+    def of(cls, poses: SE3, points: tuple[Points, ...]) -> "Estimate":
+        """Where to begin."""
+        dtype = points[0].X.dtype
+        none, damping = jnp.asarray(0, jnp.int32), jnp.asarray(DAMPING, dtype)
+        return cls(poses, points, jnp.asarray(jnp.inf, dtype), damping, none, jnp.asarray(False))
+
+    @property
+    def done(self) -> Bool[Array, ""]:
+        """Whether another step would change nothing, or none can lower the cost."""
+        return self.converged | (self.damping > HOPELESS)
+
+
+def step(batch: Batch, noise: Noise, now: Estimate, tolerance: Float[Array, ""] | float = TOLERANCE) -> Estimate:
+    """One step of Levenberg and Marquardt's, taken if it lowers the cost.
+
+    The `tolerance` is that of the length of the poses' step, over what they are known to, in the mean of squares of
+    their components; and that is judged by the noise that is found, not by the one assumed.
+    """
+
+    def said(part: tuple) -> tuple:
+        said, reduced = _said(noise, part, now.damping)
+        return said.cost + _cost_of(part[0].prior, part[1]), reduced.information, reduced.pull
+
+    each = _mapped(said, batch, now.points, now.poses)
+    equations = _held(batch, now.poses, _together([Tridiagonal.of(*x[1:]) for x in each]))
+    x = Factors.of(equations, now.damping).solve(equations.pull)
+    poses = _moved(batch, now.poses, x.reshape(-1, 6))
+
+    def moved(part: tuple) -> tuple[Points, Array]:
+        layer, points, before, after, x = part
+        views = _views(layer, noise)
+        said = linearise(before, points, views, *noise[:2])
+        points = points.moved(points_given(said, points, layer.prior, x, now.damping))
+        return points, cost(after, points, views, *noise[:2]) + _cost_of(layer.prior, points)
+
+    points, after = zip(*_mapped(moved, batch, now.points, now.poses, poses, x.reshape(-1, 6)), strict=True)
+    before, after = _sum(x[0] for x in each), _sum(after)
+    better = after <= before
+    taken, left = (poses, points, after), (now.poses, now.points, before)
+    poses, points, least = jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, left)
+    damping = jnp.maximum(now.damping * jnp.where(better, BETTER, WORSE), LEAST)
+    looks = sum(jnp.sum(layer.mask) for layer in batch.layers)
+    length = jnp.sum(x * equations.pull) / (6 * jnp.sum(batch.present)) / (before / (2 * looks))
+    converged = better & (length < tolerance**2)
+    return Estimate(poses, points, least, damping, now.steps + 1, converged)
+
+
+def optimum(
+    batch: Batch,
+    noise: Noise,
+    poses: SE3,
+    points: tuple[Points, ...],
+    *,
+    tolerance: Float[Array, ""] | float = TOLERANCE,
+    most: int = 50,
+) -> Estimate:
+    """The least cost that is reached from `poses` and `points` in `most` steps. Its derivatives are in `implicit`."""
+
+    def going(now: Estimate) -> Array:
+        return ~now.done & (now.steps < most)
+
+    return jax.lax.while_loop(going, lambda now: step(batch, noise, now, tolerance), Estimate.of(poses, points))
+
+
+class Known(NamedTuple):
+    """What is known at an estimate.
+
+    Attributes:
+        covariance: (k, 6, 6) of the poses' errors, left perturbations (linear, angular), scene units and radians.
+        points: Of each layer, what is known of its points.
+    """
+
+    covariance: Float[Array, "k 6 6"]
+    points: "tuple[KnownPoints, ...]"
+
+
+class KnownPoints(NamedTuple):
+    """What is known of the points of a layer.
+
+    Attributes:
+        spread: (c, 4, 3, n) three errors of standard deviation sigma of each point, as `jaxtri.BasePoint` has them:
+            its own, the poses given.
+        residual: (c, 2 b, 2, n) of the image points, over sigma; zero where nothing is seen.
+        weights: (c, 2 b, n) robust weights of what is new in them.
+    """
+
+    spread: Float[Array, "c 4 3 n"]
+    residual: Float[Array, "c v 2 n"]
+    weights: Float[Array, "c v n"]
+
+
+def known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Known:
+    """The covariances at an estimate."""
+
+    def chunk(part: tuple) -> tuple[Array, Array, KnownPoints]:
+        said, reduced = _said(noise, part)
+        spread = jnp.einsum("qsn,tsn->qtn", part[1].basis, reduced.root) / noise.sigma
+        return reduced.information, reduced.pull, KnownPoints(spread, said.residual, said.weights)
+
+    information, pull, of_points = zip(*_mapped(chunk, batch, points, poses), strict=True)
+    equations = _together([Tridiagonal.of(*x) for x in zip(information, pull, strict=True)])
+    blocks = Factors.of(_held(batch, poses, equations), jnp.zeros((), noise.sigma.dtype)).covariances()
+    free, b = _free(batch, poses), batch.layers[-1].size
+    each = blocks.reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)].swapaxes(0, 1).reshape(-1, 6, 6)
+    return Known(free @ each @ free, of_points)
+
+
+def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 1e-9) -> tuple[SE3, tuple[Points, ...]]:
+    """Poses and points of an optimum, with their derivatives: with respect to the image points and the noise.
+
+    By the implicit function theorem: one step of Newton's, by the whole curvature of the robust cost, from where the
+    steps without it have ended; what these left open it removes. Its equations are solved by conjugate gradients,
+    preconditioned by those of Gauss and Newton. All chunks are kept in memory.
+    """
+    still = jax.lax.stop_gradient
+    poses, points = still(found.poses), still(found.points)
+    free = _free(batch, poses)
+
+    def slope(errors: tuple, batch: Batch, noise: Noise) -> tuple:
+        def objective(errors: tuple) -> Array:
+            moved = _moved(batch, poses, jnp.einsum("kab,kb->ka", free, errors[0]))
+            new = tuple(jax.vmap(Points.moved)(p, e) for p, e in zip(points, errors[1], strict=True))
+
+            def chunk(part: tuple) -> Array:
+                layer, points, pair = part
+                return cost(pair, points, _views(layer, noise), *noise[:2]) + _cost_of(layer.prior, points)
+
+            return _sum(_mapped(jax.checkpoint(chunk), batch, new, moved)) / 2
+
+        return jax.grad(objective)(errors)
+
+    dtype = noise.sigma.dtype
+    zero = jnp.zeros((len(batch.present), 6), dtype), tuple(jnp.zeros_like(p.X[:, :3]) for p in points)
+    at = still(batch), still(noise)
+
+    def curvature(direction: tuple) -> tuple:
+        along = jax.jvp(lambda e: slope(e, *at), (zero,), (direction,))[1]
+        return along[0] + direction[0] - jnp.einsum("kab,kb->ka", free, direction[0]), along[1]
+
+    right = slope(zero, batch, noise)
+    # In the coordinates that make those of Gauss and Newton the identity. As one vector, and compiled by itself: `cg`
+    # does not take the tracers of a forward derivative otherwise.
+    root = _root(*at, poses, points)
+    back = jax.vjp(root, zero)[1]
+    flat, tree = ravel_pytree(back(right)[0])
+
+    @jax.jit
+    def solve(right: Array) -> Array:
+        def whitened(x: Array) -> Array:
+            return ravel_pytree(back(curvature(root(tree(x))))[0])[0]
+
+        return jax.scipy.sparse.linalg.cg(whitened, right, tol=tolerance, maxiter=MOST)[0]
+
+    newton = root(tree(solve(flat)))
+    x = -jnp.einsum("kab,kb->ka", free, newton[0])
+    new = tuple(jax.vmap(Points.moved)(p, -e) for p, e in zip(points, newton[1], strict=True))
+    return _moved(batch, poses, x), new
+
+
+def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Callable[[tuple], tuple]:
+    """S with S' H S = I, H the matrix of Gauss and Newton for poses and points."""
+    reduced = _mapped(lambda part: _said(noise, part)[1], batch, points, poses)
+    equations = _held(batch, poses, _together([Tridiagonal.of(r.information, r.pull) for r in reduced]))
+    factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
+
+    def root(white: tuple) -> tuple:
+        x = factors.up(white[0].reshape(equations.pull.shape)).reshape(white[0].shape)
+        new = []
+        for layer, r, w in zip(batch.layers, reduced, white[1], strict=True):
+            own = w - jnp.einsum("cetn,ce->ctn", r.cross, pairs(layer.size, x).reshape(len(w), -1))
+            new.append(jnp.einsum("ctsn,ctn->csn", r.root, own))
+        return x, tuple(new)
+
+    return root
+
+
+def _sum(each: Iterable[Array]) -> Float[Array, ""]:
+    return jnp.sum(jnp.concatenate(list(each)))
+
+
+def _views(layer: Layer, noise: Noise) -> Views:
+    return Views(layer.observed, layer.mask, noise.correlation)
+
+
+def _said(noise: Noise, part: tuple, damping: Float[Array, ""] | float = 0.0) -> tuple[Linearised, Reduced]:
+    layer, points, pair = part
+    said = linearise(pair, points, _views(layer, noise), *noise[:2])
+    return said, reduce(said, points, layer.prior, damping=damping)
+
+
+def _cost_of(prior: PointPrior, points: Points) -> Float[Array, ""]:
+    return jnp.sum(((prior.mean - points.inverse_depth) / prior.sd) ** 2)
+
+
+def _mapped(function: Callable[[tuple], Any], batch: Batch, points: tuple[Points, ...], *of_poses: Any) -> list:
+    """What a function gives of each chunk, layer by layer, and of what is given of its keyframes."""
+    return [
+        jax.lax.map(function, (layer, p, *(pairs(layer.size, x) for x in of_poses)))
+        for layer, p in zip(batch.layers, points, strict=True)
+    ]
+
+
+def pairs(size: int, each: Any) -> Any:
+    """What each chunk needs of something of every keyframe: that of its two blocks of this size."""
+
+    def pair(x: Array) -> Array:
+        blocks = x.reshape(-1, size, *x.shape[1:])
+        return jnp.concatenate([blocks[:-1], blocks[1:]], axis=1)
+
+    return jax.tree.map(pair, each)
+
+
+def _together(layers: list[Tridiagonal]) -> Tridiagonal:
+    """What all layers say, in the blocks of the last."""
+    total = layers[0]
+    for layer in layers[1:]:
+        total = jax.tree.map(jnp.add, total.coarser(layer.pull.shape[1] // total.pull.shape[1]), layer)
+    return total
+
+
+def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:
+    """The poses moved by errors that are free: what is given stays so, and not only to first order."""
+    moved = jax.vmap(retract)(poses, x)
+
+    def between(poses: SE3) -> SE3:
+        first, far = (jax.tree.map(lambda x, i=i: x[i], poses) for i in (0, batch.farthest))
+        return relative(first, far)
+
+    before, after = between(poses).translation(), between(moved)
+    length = safe_divide(safe_norm(before), safe_norm(after.translation()))
+    first = jax.tree.map(lambda x: x[0], moved)
+    far = multiply(compose(after.rotation(), after.translation() * length), first)
+    return jax.tree.map(lambda x, y: x.at[batch.farthest].set(y), moved, far)
+
+
+def _free(batch: Batch, poses: SE3) -> Float[Array, "k 6 6"]:
+    """Projections on what the gauge leaves of the poses' errors; empty places have none."""
+    k = len(batch.present)
+    first = jax.tree.map(lambda x: x[0], poses)
+
+    def one(index: Array, present: Array, pose: SE3) -> Array:
+        far = without_length(relative(first, pose).translation())
+        free = jnp.where(index == batch.farthest, far, jnp.eye(6, dtype=far.dtype))
+        return jnp.where(present & (index > 0), free, 0.0)
+
+    return jax.vmap(one)(jnp.arange(k), batch.present, poses)
+
+
+def _held(batch: Batch, poses: SE3, equations: Tridiagonal) -> Tridiagonal:
+    """The equations whose solution has no other errors than those that are free."""
+    b = batch.layers[-1].size
+    free = _free(batch, poses).reshape(-1, b, 6, 6)
+
+    def projected(left: Array, A: Array, right: Array) -> Array:
+        return jnp.einsum("kab,kblc,lcd->kald", left, A.reshape(b, 6, b, 6), right).reshape(6 * b, 6 * b)
+
+    diagonal = jax.vmap(projected)(free, equations.diagonal, free)
+    above = jax.vmap(projected)(free[:-1], equations.above, free[1:])
+    size = jnp.diagonal(equations.diagonal, axis1=1, axis2=2).reshape(-1, b, 6).mean(axis=2)
+    # What is not free gets information of its own: as much as the rest of its pose, so that all stay of one scale.
+    rest = (jnp.eye(6, dtype=size.dtype) - free) * jnp.where(size > 0, size, 1.0)[..., None, None]
+    eye = jnp.eye(b, dtype=size.dtype)
+    rest = (rest[:, :, :, None] * eye[:, None, :, None]).reshape(-1, 6 * b, 6 * b)
+    pull = jnp.einsum("mkab,mkb->mka", free, equations.pull.reshape(-1, b, 6)).reshape(equations.pull.shape)
+    return Tridiagonal(diagonal + rest, above, pull)

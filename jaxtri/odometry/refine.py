@@ -1,0 +1,353 @@
+"""A whole run once more, from all that was seen: keyframes and points at once, then the frames between them.
+
+Keyframes are frames between which the tracks have moved by `Settings.keyframe_flow`. Their poses and all points seen
+from them are brought to maximum likelihood (`jaxtri.estimation.batch`), from what the recursive filter made of them.
+A frame between two of them is then measured from the points as they are. A feature that is followed drifts slowly, so
+that what it errs by in such a frame lies between what it errs by in the two keyframes, and that is known.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxlie import SE3
+from jaxtyping import Array, Float
+from tqdm import tqdm
+
+from jaxtri.compilation import capacity
+from jaxtri.errors import InputError
+from jaxtri.estimation import batch
+from jaxtri.estimation.batch import Batch, Estimate, Layer, Noise
+from jaxtri.estimation.bundle import Looks, PointPrior, Views, looks, seen_from
+from jaxtri.estimation.bundle import Points as Homogeneous
+from jaxtri.filters import ekf
+from jaxtri.geometry.pose import adjoint, exp_pose, local, multiply, relative
+from jaxtri.models.base_pairs import BasePairs, BasePoint
+from jaxtri.models.motion import Twist
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.measuring import doubts, median
+from jaxtri.odometry.poses import FramePose, trajectory
+from jaxtri.odometry.settings import Settings, Status
+from jaxtri.odometry.stretches import Pieces, Segment, blocks, keyframes, segments
+from jaxtri.odometry.structure import Points, world_points
+from jaxtri.odometry.window import AGREES, FAREST, NEAREST, VAGUE
+from jaxtri.trajectory import Trajectory
+
+FEWEST = 3  # keyframes that there must be: two are what a start has made of them
+TOGETHER = 64  # frames that are measured by one call
+MOST = 50  # steps; a dozen are usual
+TINY = 1e-12  # a weight that is none
+
+
+@dataclass
+class Refinement:
+    """What all that was seen says of a run.
+
+    Attributes:
+        poses: One `FramePose` a frame; its `nis` is by the noise that was found. A frame that the camera was not
+            followed in is as it was.
+        points: The scene; covariances of each point's own error, the poses given.
+        keyframes: Numbers of the frames that were adjusted together with the points.
+        statistics: Figures, as `run.json` has them.
+    """
+
+    poses: list[FramePose]
+    points: Points
+    keyframes: list[int]
+    statistics: dict[str, object]
+
+    def trajectory(self) -> Trajectory:
+        """Camera poses, camera to world, one a frame."""
+        return trajectory(self.poses, "none was refined")
+
+
+def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
+    """Bundle adjustment of a run: `Odometry(..., record=True)`, or `run.odometry` of `track(..., record=True)`.
+
+    Where the camera was lost, each part is refined by itself. Its first pose stays, and so does its scale: the distance
+    from there to the keyframe that is farthest from it. Covariances are with respect to these two. Raises
+    `InputError` where no tracks were kept, `InitialisationError` where there is no pose.
+    """
+    if not odometry.record:
+        raise InputError("nothing was recorded: ask for it by record=True")
+    odometry.trajectory()  # takes in what is queued, and raises where there is none
+    assert odometry.settings is not None
+    poses, points, chosen, parts = list(odometry.poses), [], [], []
+    moved = np.eye(4)  # of the world, by what was refined before
+    at = 0
+    for first, end in segments(odometry):
+        poses[at:first] = [_in(pose, moved) for pose in poses[at:first]]
+        segment = Segment.of(odometry, first, end)
+        keys = keyframes(odometry.settings, segment)
+        last = poses[end - 1].T_camera_world
+        found = _Adjusted.of(odometry.settings, segment, keys, progress) if len(keys) >= FEWEST else None
+        if found is None:
+            parts.append({"frames": [first, end - 1], "refined": False})
+        else:
+            poses[first:end] = found.frames(odometry.settings, poses[first:end])
+            points.append(found.points(odometry.settings, moved))
+            chosen += [first + int(k) for k in keys]
+            parts.append({"frames": [first, end - 1], "refined": True} | found.statistics)
+        poses[first:end] = [_in(pose, moved) for pose in poses[first:end]]
+        new = poses[end - 1].T_camera_world
+        assert last is not None
+        assert new is not None
+        moved, at = np.linalg.inv(last) @ new, end
+    poses[at:] = [_in(pose, moved) for pose in poses[at:]]
+    together = _best(Points(*(np.concatenate(x) for x in zip(*points, strict=True)))) if points else odometry.points()
+    return Refinement(poses, together, chosen, {"parts": parts, "keyframes": len(chosen)})
+
+
+def _in(pose: FramePose, moved: np.ndarray) -> FramePose:
+    """The pose in a world that has been moved."""
+    T = pose.T_camera_world
+    return pose if T is None else replace(pose, T_camera_world=T @ moved)
+
+
+def _best(points: Points) -> Points:
+    """Each track once, as it is known best: where it was cut it has several points."""
+    order = np.argsort(np.trace(points.covariance, axis1=1, axis2=2), kind="stable")
+    _, which = np.unique(points.ids[order], return_index=True)
+    return Points(*(x[order[which]] for x in points))
+
+
+@dataclass
+class _Adjusted:
+    """A stretch whose keyframes and points have been adjusted."""
+
+    segment: Segment
+    keys: np.ndarray
+    pieces: Pieces
+    noise: Noise
+    depth: float
+    poses: SE3
+    covariance: np.ndarray  # (k, 6, 6)
+    inflation: float  # of the variances that were assumed, by what the residuals say
+    X: np.ndarray  # (p, 4) homogeneous points
+    spread: np.ndarray  # (p, 4, 3) their own errors, over sigma
+    residual: np.ndarray  # (o, 2) of the looks, over sigma
+    weights: np.ndarray  # (o,)
+    statistics: dict[str, object]
+
+    @classmethod
+    def of(cls, settings: Settings, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
+        """Those of a stretch; None where nothing finite came of it."""
+        pieces = Pieces.of(segment, keys)
+        dtype, k = segment.u.dtype, blocks(len(keys))[1]
+        centre = -np.einsum("kji,kj->ki", segment.T[keys, :3, :3], segment.T[keys, :3, 3])
+        farthest = int(np.argmax(np.linalg.norm(centre - centre[0], axis=1)))
+        T = np.concatenate([segment.T[keys], np.broadcast_to(np.eye(4), (k - len(keys), 4, 4))]).astype(dtype)
+        poses = SE3.from_matrix(jnp.asarray(T))
+        layers, points, depth = _begun(settings, jax.tree.map(jnp.asarray, pieces.layers), poses)
+        problem = Batch(layers, jnp.arange(k) < len(keys), jnp.asarray(farthest))
+        noise = Noise(settings.sigma, settings.robust.scale.astype(dtype), settings.correlation)
+        now, costs = Estimate.of(poses, points), []
+        bar = tqdm(total=MOST, unit="step", desc="refine", disable=None if progress else True, leave=False)
+        while not bool(now.done) and len(costs) < MOST:
+            now = _step(problem, noise, now)
+            costs.append(float(now.cost))
+            bar.set_postfix_str(f"cost {costs[-1]:.6g}", refresh=False)
+            bar.update()
+        bar.close()
+        known = _known(problem, noise, now.poses, now.points)
+        covariance = np.asarray(known.covariance)[: len(keys)]
+        if not (np.isfinite(covariance).all() and np.isfinite(np.asarray(now.poses.wxyz_xyz)).all()):
+            return None
+        X = pieces.each([np.asarray(p.X) for p in now.points], (4,))
+        spread, residual, weights = ([np.asarray(x) for x in y] for y in zip(*known.points, strict=True))
+        looks = pieces.looks(residual, (2,)), pieces.looks(weights, ())
+        agree = looks[1] > AGREES
+        points = (np.bincount(pieces.piece[agree], minlength=len(pieces.ids)) > 1).sum()
+        free = 1 - (3 * points + 6 * len(keys)) / (2 * max(int(agree.sum()), 1))
+        inflation = _inflation(looks[1], float(noise.scale), free)
+        said = {
+            "keyframes": len(keys),
+            "tracks": len(pieces.ids),
+            "observations": len(pieces.key),
+            "steps": len(costs),
+            "converged": bool(now.converged),
+            "noise_over_assumed": float(f"{np.sqrt(inflation):.3g}"),
+        }
+        spread = pieces.each(spread, (4, 3)) * np.sqrt(inflation)
+        start = now.poses, covariance * inflation, inflation
+        return cls(segment, keys, pieces, noise, float(depth), *start, X, spread, *looks, said)
+
+    def points(self, settings: Settings, moved: np.ndarray) -> Points:
+        """The points that at least two looks agree on, in a world that has been moved."""
+        count = len(self.X)
+        pad = np.zeros(capacity(count) - count, int)  # each length is compiled once
+        items = BasePoint(*(jnp.asarray(np.concatenate([x, x[pad]])) for x in (self.X, self.spread)))
+        xyz, covariance, known = (np.asarray(x)[:count] for x in world_points(items, settings))
+        agree = np.bincount(self.pieces.piece[self.weights > AGREES], minlength=count) > 1
+        good = agree & known & np.isfinite(xyz).all(axis=1)
+        R, t = moved[:3, :3], moved[:3, 3]
+        # A pose becomes T moved, so a point of the world its inverse of it.
+        return Points(self.pieces.ids[good], (xyz[good] - t) @ R, R.T @ covariance[good] @ R)
+
+    def frames(self, settings: Settings, before: list[FramePose]) -> list[FramePose]:
+        """The poses of all frames, `before` what they were."""
+        found, T, count, scale = (
+            list(before),
+            np.asarray(_matrices(self.poses)),
+            len(self.keys),
+            float(self.noise.scale),
+        )
+        distance = scale * (1 / np.sqrt(np.maximum(self.weights, TINY)) - 1) / self.inflation
+        agree = distance < scale
+        distance = _over_found(distance, agree)
+        measured = np.bincount(self.pieces.key, minlength=count)
+        used = np.bincount(self.pieces.key[agree], minlength=count)
+        nis = np.bincount(self.pieces.key[agree], weights=distance[agree], minlength=count)
+        for i, k in enumerate(self.keys):
+            counts = int(used[i]), float(nis[i]), int(measured[i])
+            found[k] = _judged(before[k], T[i], self.covariance[i], *counts)
+        between = np.setdiff1d(np.arange(len(before)), self.keys)
+        if not len(between):
+            return found
+        groups = (between[at : at + TOGETHER] for at in range(0, len(between), TOGETHER))
+        T, own, owed, distance, mask = map(
+            np.concatenate, zip(*(self._between(settings, g) for g in groups), strict=True)
+        )
+        # The noise of what is new between two keyframes is another one, and is found from what these frames say.
+        weights, measured = (1 + distance[mask] / scale) ** -2.0, mask.sum(axis=1)
+        inflation = _inflation(weights, scale, 1 - 3 * len(between) / max(mask.sum(), 1))
+        agree = mask & (distance < scale * inflation)
+        distance = _over_found(distance, agree)
+        covariance = inflation * own + owed
+        used, nis = agree.sum(axis=1), np.where(agree, distance, 0.0).sum(axis=1)
+        for i, k in enumerate(between):
+            counts = int(used[i]), float(nis[i]), int(measured[i])
+            found[k] = _judged(before[k], T[i], covariance[i], *counts)
+        return found
+
+    def _between(self, settings: Settings, frames: np.ndarray) -> list[np.ndarray]:
+        """Frames between keyframes: poses, covariances given the keyframes and by these, distances of the points.
+
+        The last are squared, in standard deviations, and which points were measured stands beside them.
+        """
+        before = np.searchsorted(self.keys, frames) - 1
+        t0, t1, t = (self.segment.times[x] for x in (self.keys[before], self.keys[before + 1], frames))
+        share = (t - t0) / (t1 - t0)
+        which, kept, variance = self._kept(frames, before, share)
+        observed = self.segment.u[frames] - float(self.noise.sigma) * kept
+        # Between two known poses: so far the path is bent by an acceleration as large as the filter takes it to be.
+        bend = ((t - t0) * (t1 - t) / 2)[:, None]
+        sd = bend * np.repeat([float(settings.acceleration) * self.depth, float(settings.angular_acceleration)], 3)
+        arguments = (before, share, sd, self.X[which], observed, which >= 0, np.sqrt(variance))
+        rest = np.zeros(TOGETHER - len(frames), int)
+        padded = [jnp.asarray(np.concatenate([x, x[rest]])) for x in arguments]
+        said = _measured(settings, self.depth, self.poses, jnp.asarray(self.covariance), *padded)
+        return [*(np.asarray(x)[: len(frames)] for x in said), which >= 0]
+
+    def _kept(
+        self, frames: np.ndarray, before: np.ndarray, share: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The piece (t, n) in each slot, -1 for none; what it errs by in a frame, and the variance of that, over sigma.
+
+        An autoregression between two of its values, or beside one: a bridge.
+        """
+        ids, seen, phi = self.segment.ids, self.segment.seen[frames], float(self.noise.correlation)
+        place = np.full((len(self.keys), seen.shape[1]), -1)
+        place[self.pieces.key, self.pieces.slot] = np.arange(len(self.pieces.key))
+
+        def at(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            look = place[index]
+            there = seen & (ids[frames] == ids[self.keys[index]]) & (look >= 0)
+            return np.where(there, self.pieces.piece[look], -1), self.residual[look]
+
+        (left, r0), (right, r1) = at(before), at(before + 1)
+        which = np.where(left >= 0, left, right)
+        a = np.where(left >= 0, phi ** share[:, None], 0.0)
+        b = np.where((right >= 0) & (right == which), phi ** (1 - share[:, None]), 0.0)
+        whole = 1 - (a * b) ** 2
+        kept = (a * (1 - b**2) / whole)[..., None] * r0 + (b * (1 - a**2) / whole)[..., None] * r1
+        return which, kept, (1 - a**2) * (1 - b**2) / whole
+
+
+def _inflation(weights: np.ndarray, scale: float, free: float) -> float:
+    """By how much the variance of an estimate is above what the assumed noise makes it.
+
+    That of an estimate by a robust cost is E[psi^2] / E[psi']^2 over the information of plain squares, psi the slope of
+    the cost; the normal equations have E[w] in the place of both. `free` is the share of the residuals that the
+    unknowns have not taken. Source: Huber 1981, section 6.3.
+    """
+    if not len(weights):
+        return 1.0
+    root = np.sqrt(np.maximum(weights, TINY))
+    squared, slope, mean = weights**2 * scale * (1 / root - 1) / 2, weights * (2 * root - 1), weights.mean()
+    return float(squared.mean() * mean / max(slope.mean(), mean / 10) ** 2 / max(free, 0.1))
+
+
+def _over_found(distance: np.ndarray, agree: np.ndarray) -> np.ndarray:
+    """Squared distances in the mean of those that agree, so that this is 2, as of two components of right noise."""
+    return 2 * distance / max(float(distance[agree].mean()) if agree.any() else 2.0, TINY)
+
+
+_step, _known, _matrices = jax.jit(batch.step), jax.jit(batch.known), jax.jit(SE3.as_matrix)
+
+
+@jax.jit
+def _begun(
+    settings: Settings, layers: list[tuple[Array, Array]], poses: SE3
+) -> tuple[tuple[Layer, ...], tuple[Homogeneous, ...], Float[Array, ""]]:
+    """The layers, the points by the first and last look at them, and the median depth of the scene."""
+    found = []
+    for observed, mask in layers:
+        pairs = batch.pairs(mask.shape[1] // 2, poses)
+        found.append(jax.lax.map(lambda part: looks(part[0], Views(*part[1:])), (pairs, observed, mask)))
+    rho, angle = (jnp.concatenate([getattr(f, name).ravel() for f in found]) for name in ("inverse_depth", "angle"))
+    wide = (angle > settings.usable_parallax) & (rho > 0)
+    depth = median(1 / jnp.where(wide, rho, 1.0), wide)
+
+    def begin(first: Looks, views: tuple[Array, Array]) -> tuple[Layer, Homogeneous]:
+        rho = jnp.clip(first.inverse_depth, FAREST / depth, NEAREST / depth)
+        prior = PointPrior(jnp.full_like(rho, 1 / depth), jnp.full_like(rho, VAGUE / depth))
+        return Layer(*views, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
+
+    begun, points = zip(*map(begin, found, layers), strict=True)
+    return begun, points, depth
+
+
+@jax.jit
+def _measured(
+    settings: Settings,
+    depth: Float[Array, ""],
+    poses: SE3,
+    covariances: Float[Array, "k 6 6"],
+    *frames: Array,
+) -> tuple[Array, ...]:
+    """Frames between keyframes: poses as matrices, covariances given these and by them, distances of the points."""
+    model = BasePairs(settings.sigma, settings.acceleration * depth, settings.angular_acceleration)
+
+    def one(frame: tuple[Array, ...]) -> tuple[Array, ...]:
+        before, share, sd, X, observed, mask, scale = frame
+        a, b = (jax.tree.map(lambda x, i=i: x[i], poses) for i in (before, before + 1))
+        mean = multiply(exp_pose(share * local(a, b)), a)
+        still = jnp.ones(6, sd.dtype)
+        belief = ekf.Belief(Twist(mean, jnp.zeros(6, sd.dtype)), jnp.diag(jnp.concatenate([sd**2, still])))
+        items = BasePoint(X, jnp.zeros((*X.shape, 0), X.dtype))
+        belief, said = ekf.update(
+            model, belief, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
+        )
+        pose = belief.mean.pose
+        near, index = jax.tree.map(lambda x, y: jnp.where(share < 0.5, x, y), (a, before), (b, before + 1))
+        along = adjoint(relative(near, pose))
+        owed = along @ covariances[index] @ along.T
+        return pose.as_matrix(), belief.covariance[:6, :6], owed, said.distance
+
+    return jax.lax.map(one, frames)
+
+
+def _judged(
+    before: FramePose, T: np.ndarray, covariance: np.ndarray, used: int, nis: float, measured: int
+) -> FramePose:
+    """A frame as it is known now."""
+    T, covariance = np.asarray(T, np.float64), np.asarray(covariance, np.float64)
+    if not (np.isfinite(T).all() and np.isfinite(covariance).all()):
+        return before
+    new = replace(before, T_camera_world=T, covariance=covariance, used=used, nis=nis, measured=measured)
+    if before.status in (Status.TRACKING, Status.UNCERTAIN):
+        found = doubts(new.nis, new.used, new.measured, np.radians(new.rotation_sd_deg))
+        new.status = Status.UNCERTAIN if any(found) else Status.TRACKING
+    return new

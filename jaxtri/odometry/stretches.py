@@ -1,0 +1,158 @@
+"""Stretches that a camera was followed over: frames, keyframes, and tracks cut for `jaxtri.estimation.batch`."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.settings import Settings, Status
+from jaxtri.odometry.slots import Slotted
+
+# Keyframes of a block: of the layer for short tracks, and of the one for long ones at most, which has two blocks at
+# least. A track that is seen in more than two of them is cut.
+SMALL, BLOCK = 8, 32
+
+
+def segments(odometry: Odometry) -> list[tuple[int, int]]:
+    """First frame, and the one after the last, of each stretch that the camera was followed over."""
+    if odometry.base_pair is None:
+        return []
+    poses = odometry.poses
+    starts = [odometry.base_pair[0], *(k for k, p in enumerate(poses) if p.status is Status.RESTARTED)]
+    ends = [*starts[1:], len(poses)]
+    return [
+        (start, next((k for k in range(start, end) if poses[k].status in (Status.LOST, Status.INITIALISING)), end))
+        for start, end in zip(starts, ends, strict=True)
+    ]
+
+
+class Segment(NamedTuple):
+    """The frames of a stretch: normalised points (t, n, 2), which are seen, and the numbers of the tracks."""
+
+    u: np.ndarray
+    seen: np.ndarray
+    ids: np.ndarray
+    T: np.ndarray  # (t, 4, 4) world to camera, as it was
+    times: np.ndarray  # in frames
+    measured: np.ndarray  # (t,) frames whose pose comes from what they show
+
+    @classmethod
+    def of(cls, odometry: Odometry, first: int, end: int) -> "Segment":
+        """Of frames of a run, as it recorded them."""
+        tracks: list[Slotted] = odometry.tracks[first:end]
+        dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
+        u = np.stack([np.asarray(_normalise(odometry.camera, t.pixels.astype(dtype))) for t in tracks])
+        seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
+        poses = odometry.poses[first:end]
+        T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
+        times = np.array([p.time for p in poses]) / (odometry.frame_time or 1.0)
+        return cls(
+            np.where(seen[..., None], u, 0.0),
+            seen,
+            np.where(seen, np.stack([t.ids for t in tracks]), -1),
+            T,
+            times,
+            np.array([p.status.measured for p in poses]),
+        )
+
+
+_normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
+
+
+def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
+    """Frames between which the tracks have moved, the first and the last among them."""
+    flow, common = float(settings.keyframe_flow), float(settings.keyframe_common)
+    keys = [0]
+    for k in range(1, len(segment.u)):
+        both = (segment.ids[k] == segment.ids[keys[-1]]) & segment.seen[k]
+        shift = np.linalg.norm(segment.u[k][both] - segment.u[keys[-1]][both], axis=1)
+        if segment.measured[k] and (both.sum() < common or np.median(shift) > flow):
+            keys.append(k)
+    last = len(segment.u) - 1
+    return np.array(keys if keys[-1] == last else [*keys, last])
+
+
+class Pieces(NamedTuple):
+    """Tracks cut where a layer of chunks cannot hold them, or where they are not seen, and where each piece went.
+
+    Attributes:
+        layers: (observed, mask) of each layer: (c, 2, 2 b, n) and (c, 2 b, n).
+        ids: (p,) number of the track of each piece.
+        layer, chunk, column: (p,) where it went.
+        key, slot, piece: (o,) keyframe, slot and piece of each look.
+    """
+
+    layers: list[tuple[np.ndarray, np.ndarray]]
+    ids: np.ndarray
+    layer: np.ndarray
+    chunk: np.ndarray
+    column: np.ndarray
+    key: np.ndarray
+    slot: np.ndarray
+    piece: np.ndarray
+
+    @classmethod
+    def of(cls, segment: Segment, keys: np.ndarray) -> "Pieces":
+        """Those of the tracks that two keyframes in a row see."""
+        sizes, places = blocks(len(keys))
+        last = sizes[-1]
+        key, slot = np.nonzero(segment.seen[keys])
+        ids = segment.ids[keys][key, slot]
+        order = np.lexsort((key, ids))
+        key, slot, ids = key[order], slot[order], ids[order]
+        begins = np.r_[True, (np.diff(ids) != 0) | (np.diff(key) != 1)]
+        block = np.minimum(key // last, places // last - 2)
+        cut = (key // last - block[begins][np.cumsum(begins) - 1]) // 2
+        begins |= np.r_[False, np.diff(cut) != 0]
+        piece = np.cumsum(begins) - 1
+        kept = np.bincount(piece)[piece] > 1
+        key, slot, ids, piece = key[kept], slot[kept], ids[kept], np.unique(piece[kept], return_inverse=True)[1]
+        first, count = np.flatnonzero(np.r_[True, np.diff(piece) != 0]), np.bincount(piece)
+        begin, end = key[first], key[first + count - 1]
+        layer, chunk, column = np.full(len(first), -1), np.zeros(len(first), int), np.zeros(len(first), int)
+        layers = []
+        for number, b in enumerate(sizes):
+            c = places // b - 1
+            at = np.minimum(begin // b, c - 1)
+            here = np.flatnonzero((layer < 0) & (end < b * (at + 2)))
+            layer[here], chunk[here] = number, at[here]
+            for k in range(c):
+                column[here[at[here] == k]] = np.arange((at[here] == k).sum())
+            n = _rounded(int(column[here].max(initial=0)) + 1)
+            observed, mask = np.zeros((c, 2, 2 * b, n), segment.u.dtype), np.zeros((c, 2 * b, n), bool)
+            look = layer[piece] == number
+            where = chunk[piece[look]], key[look] - b * chunk[piece[look]], column[piece[look]]
+            observed[where[0], :, where[1], where[2]] = segment.u[keys[key[look]], slot[look]]
+            mask[where] = True
+            layers.append((observed, mask))
+        return cls(layers, ids[first], layer, chunk, column, key, slot, piece)
+
+    def each(self, of_layers: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+        """Of each piece, (p, *shape), what stands in arrays (c, *shape, n)."""
+        found = np.zeros((len(self.ids), *shape), of_layers[0].dtype)
+        for number, x in enumerate(of_layers):
+            here = self.layer == number
+            found[here] = x[self.chunk[here], ..., self.column[here]]
+        return found
+
+    def looks(self, of_layers: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+        """Of each look, (o, *shape), what stands in arrays (c, 2 b, *shape, n)."""
+        found = np.zeros((len(self.key), *shape), of_layers[0].dtype)
+        for number, x in enumerate(of_layers):
+            here = self.layer[self.piece] == number
+            piece, b = self.piece[here], x.shape[1] // 2
+            found[here] = x[self.chunk[piece], self.key[here] - b * self.chunk[piece], ..., self.column[piece]]
+        return found
+
+
+def blocks(keyframes: int) -> tuple[list[int], int]:
+    """Sizes of the blocks of all layers, and how many keyframes the last ones hold."""
+    size = BLOCK if keyframes > 2 * BLOCK else SMALL * -(-keyframes // (2 * SMALL))
+    return [SMALL, size][size == SMALL :], size * max(2, -(-keyframes // size))
+
+
+def _rounded(count: int) -> int:
+    """Up to one of a few sizes, so that little is compiled anew: four to each doubling."""
+    size = max(64, 1 << max(0, count.bit_length() - 3))
+    return -(-count // size) * size

@@ -1,0 +1,194 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxlie import SE3
+
+from jaxtri.estimation import batch
+from jaxtri.estimation.batch import Batch, Estimate, Layer, Noise
+from jaxtri.estimation.bundle import PointPrior, Views, block_diagonal, linearise, looks, reduce, seen_from
+from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
+from jaxtri.geometry.pose import matrix, retract
+
+K, SMALL, LARGE = 16, 2, 4  # places, of which the last two are empty; blocks of two layers
+SEEN, FARTHEST, SIGMA = 14, 13, 1e-3
+NOISE = Noise(jnp.asarray(SIGMA), jnp.asarray(16.0), jnp.asarray(0.8))
+PLAIN = Noise(jnp.asarray(SIGMA), jnp.asarray(1e9), jnp.asarray(0.8))
+
+
+def camera_path():
+    t = np.arange(K)[:, None]
+    errors = np.concatenate([-t * [0.15, 0.01, 0.02], 0.05 * np.sin(t / 3) * [0.3, 1.0, 0.5]], axis=1)
+    return jax.vmap(lambda e: retract(SE3.identity(), e))(jnp.asarray(errors))
+
+
+def made(noise=0.0, seed=0):
+    """A path before points; short and long tracks, each in the layer that holds it. The truth beside it."""
+    rng = np.random.default_rng(1)
+    poses = camera_path()
+    R, T = np.asarray(jax.vmap(lambda p: matrix(p.rotation()))(poses)), np.asarray(poses.translation())
+    layers, truth, draw = [], [], np.random.default_rng(seed)
+    for size, n in ((SMALL, 10), (LARGE, 8)):
+        chunks = K // size - 1
+        X = rng.uniform([-1.5, -1, 3], [3.5, 1, 6], (chunks, n, 3))
+        mask = np.zeros((chunks, 2 * size, n), bool)
+        for c in range(chunks):
+            for i in range(n):
+                begin = rng.integers(0, size)
+                mask[c, begin : begin + rng.integers(2, 2 * size + 1), i] = True
+            mask[c, np.arange(size * c, size * (c + 2)) >= SEEN] = False
+        at = size * np.arange(chunks)[:, None] + np.arange(2 * size)
+        Z = np.einsum("cvij,cnj->cvin", R[at], X) + T[at][..., None]
+        white = draw.normal(size=Z[:, :, :2].shape) * SIGMA * noise
+        for v in range(1, 2 * size):  # a part of each error is that of the view before
+            again = (mask[:, v] & mask[:, v - 1])[:, None]
+            white[:, v] = np.where(again, 0.8 * white[:, v - 1] + 0.6 * white[:, v], white[:, v])
+        observed = np.moveaxis(Z[:, :, :2] / Z[:, :, 2:] + white, 2, 1)
+        prior = PointPrior(jnp.full((chunks, n), 0.2), jnp.full((chunks, n), 20.0))
+        layers.append(Layer(jnp.asarray(observed), jnp.asarray(mask), prior))
+        truth.append(X)
+    return Batch(tuple(layers), jnp.arange(K) < SEEN, jnp.asarray(FARTHEST)), poses, truth
+
+
+def begun(problem, poses):
+    """Points by their first and last look."""
+
+    def one(layer):
+        first = jax.vmap(lambda p, o, m: looks(p, Views(o, m)))(batch.pairs(layer.size, poses), *layer[:2])
+        return jax.vmap(seen_from)(first.R, first.T, first.u, jnp.clip(first.inverse_depth, 0.05, 1.0))
+
+    return tuple(map(one, problem.layers))
+
+
+def off(poses, size, seed=3):
+    errors = np.random.default_rng(seed).normal(size=(K, 6)) * size
+    errors[0] = 0
+    return jax.vmap(retract)(poses, jnp.asarray(errors))
+
+
+optimum = jax.jit(batch.optimum, static_argnames=("most",))
+
+
+def test_the_equations_are_those_of_all_tracks_in_one_piece():
+    """Blocks, layers, gauge and covariances: against one dense matrix of every pose."""
+    problem, poses, _ = made(noise=1.0)
+    points = begun(problem, poses)
+    dense, pull = np.zeros((6 * K, 6 * K)), np.zeros(6 * K)
+    for layer, p in zip(problem.layers, points, strict=True):
+        for c in range(len(layer.mask)):
+            observed, mask = np.zeros((2, K, layer.mask.shape[2])), np.zeros((K, layer.mask.shape[2]), bool)
+            rows = slice(layer.size * c, layer.size * (c + 2))
+            observed[:, rows], mask[rows] = layer.observed[c], layer.mask[c]
+            views = Views(jnp.asarray(observed), jnp.asarray(mask), NOISE.correlation)
+            chunk, prior = jax.tree.map(lambda x, c=c: x[c], (p, layer.prior))
+            said = reduce(linearise(poses, chunk, views, *NOISE[:2]), chunk, prior)
+            dense, pull = dense + said.information, pull + said.pull
+    # The first pose is given, and the distance of the one that is farthest; empty places have no errors.
+    free = np.ones((K, 6, 6)) * np.eye(6)
+    free[0] = free[SEEN:] = 0
+    along = np.asarray(poses.translation())[FARTHEST]  # of the first pose's origin, which is the world's
+    free[FARTHEST, :3, :3] -= np.outer(along, along) / (along @ along)
+    P = np.asarray(block_diagonal(jnp.asarray(free)))
+    covariance = np.linalg.pinv(P @ dense @ P, rcond=1e-11, hermitian=True)
+    known = jax.jit(batch.known)(problem, NOISE, poses, points)
+    own = covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
+    np.testing.assert_allclose(known.covariance, own, rtol=1e-5, atol=1e-7 * own.max())
+    # One step, undamped, is that of the dense equations.
+    now = Estimate.of(poses, points)._replace(damping=jnp.asarray(0.0))
+    after = jax.jit(batch.step)(problem, PLAIN, now)
+    moved = jax.jit(batch.step)(problem, NOISE, now)
+    assert after.cost < 1e6
+    x = P @ np.linalg.pinv(P @ dense @ P, rcond=1e-11, hermitian=True) @ P @ pull
+    expected = np.array(jax.vmap(retract)(poses, jnp.asarray(x.reshape(K, 6))).wxyz_xyz)
+    expected[FARTHEST, 4:] *= np.linalg.norm(along) / np.linalg.norm(expected[FARTHEST, 4:])  # given, not only at first
+    np.testing.assert_allclose(moved.poses.wxyz_xyz, expected, atol=1e-7)
+
+
+def test_factors_solve_and_invert_a_block_tridiagonal_matrix():
+    rng = np.random.default_rng(0)
+    root = np.kron(np.eye(4) + np.eye(4, k=1), np.ones((3, 3))) * rng.normal(size=(12, 12))
+    A = root @ root.T + 3 * np.eye(12)
+    blocks = A.reshape(4, 3, 4, 3).swapaxes(1, 2)
+    at = np.arange(4)
+    b = rng.normal(size=(4, 3))
+    fine = Tridiagonal(*map(jnp.asarray, (blocks[at, at], blocks[at[:-1], at[1:]], b)))
+    for equations in (fine, fine.coarser(2)):
+        factors = Factors.of(equations, jnp.asarray(0.0))
+        np.testing.assert_allclose(factors.solve(equations.pull).ravel(), np.linalg.solve(A, b.ravel()), rtol=1e-9)
+        s = equations.pull.shape[1]
+        inverse = np.linalg.inv(A).reshape(12 // s, s, 12 // s, s)
+        own = inverse[np.arange(12 // s), :, np.arange(12 // s)]
+        np.testing.assert_allclose(factors.covariances(), own, rtol=1e-9, atol=1e-12)
+
+
+def test_exact_points_lead_back_to_the_path():
+    problem, poses, truth = made()
+    wrong = off(poses, 0.01)
+    found = optimum(problem, PLAIN, wrong, begun(problem, wrong), tolerance=1e-9)
+    assert found.converged
+    assert found.cost < 1e-3  # the vague prior's
+    # Up to the gauge: the scale is that of the pose that is farthest, as it was given.
+    scale = np.linalg.norm(wrong.translation()[FARTHEST]) / np.linalg.norm(poses.translation()[FARTHEST])
+    assert abs(scale - 1) > 1e-3
+    np.testing.assert_allclose(found.poses.translation()[:SEEN], scale * poses.translation()[:SEEN], atol=2e-6)
+    np.testing.assert_allclose(found.poses.rotation().wxyz[:SEEN], poses.rotation().wxyz[:SEEN], atol=1e-6)
+    for p, X, layer in zip(found.points, truth, problem.layers, strict=True):
+        seen = np.asarray(layer.mask.sum(axis=1)) > 2
+        xyz = np.moveaxis(np.asarray(p.X[:, :3] / p.X[:, 3:]), 1, 2)
+        np.testing.assert_allclose(xyz[seen], scale * X[seen], rtol=1e-3, atol=1e-3)
+
+
+def test_covariances_are_those_of_the_errors():
+    """NEES of the newest pose and of one in the middle over many noises, as correlated as they are taken to be."""
+    from intervals import nees_interval
+
+    problem, poses, _ = made()
+    draws = 60
+    batches = [made(noise=1.0, seed=k)[0] for k in range(draws)]
+    many = jax.tree.map(lambda *x: jnp.stack(x), *batches)
+    start = begun(problem, poses)
+
+    @jax.jit
+    def run(problem):
+        found = batch.optimum(problem, PLAIN, poses, start, tolerance=1e-3, most=8)
+        known = batch.known(problem, PLAIN, found.poses, found.points)
+        errors = jax.vmap(lambda a, b: (b @ a.inverse()).log())(found.poses, poses)
+        return errors, known.covariance
+
+    errors, C = jax.lax.map(run, many)
+    for pose, free in ((6, np.arange(6)), (FARTHEST, np.arange(6))):
+        e, c = np.asarray(errors[:, pose]), np.asarray(C[:, pose])
+        # Of the farthest pose the part along the base line is given: five are free.
+        nees = np.einsum("da,dab,db->d", e, np.linalg.pinv(c, rcond=1e-9, hermitian=True), e)
+        low, high = nees_interval(len(free) - (pose == FARTHEST), draws)
+        assert low < nees.mean() < high, (pose, nees.mean(), low, high)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivatives_of_the_optimum(mode):
+    """By the implicit function theorem, against central differences of the optimum itself."""
+    problem, poses, _ = made(noise=1.0)
+    start = begun(problem, poses)
+    rng = np.random.default_rng(5)
+    direction = jnp.asarray(rng.normal(size=problem.layers[1].observed.shape)) * SIGMA
+    weights = jnp.asarray(rng.normal(size=(K, 6)))
+
+    def shifted(s):
+        long = problem.layers[1]._replace(observed=problem.layers[1].observed + s[0] * direction)
+        noise = Noise(NOISE.sigma * jnp.exp(s[1]), NOISE.scale, NOISE.correlation + s[2])
+        return problem._replace(layers=(problem.layers[0], long)), noise
+
+    def value(s, found=None):
+        moved, noise = shifted(s)
+        if found is None:
+            found = batch.optimum(moved, noise, poses, start, tolerance=1e-9, most=60)
+        at, points = batch.implicit(moved, noise, found)
+        errors = jax.vmap(lambda a, b: (b @ a.inverse()).log())(poses, at)
+        return jnp.sum(weights * errors) + jnp.sum(points[0].X * 1e-3)
+
+    zero = jnp.zeros(3)
+    found = jax.jit(lambda: batch.optimum(*shifted(zero), poses, start, tolerance=1e-9, most=60))()
+    slopes = (jax.jacfwd if mode == "forward" else jax.grad)(lambda s: value(s, found))
+    plain, h = jax.jit(value), 1e-3
+    central = [(plain(zero.at[i].set(h)) - plain(zero.at[i].set(-h))) / (2 * h) for i in range(3)]
+    np.testing.assert_allclose(jax.jit(slopes)(zero), central, rtol=2e-4, atol=1e-8)

@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+from tracks import make, sideways
+
+from jaxtri.errors import InitialisationError, InputError
+from jaxtri.odometry import stretches
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.refine import refine
+from jaxtri.odometry.run import follow_tracks
+from jaxtri.odometry.settings import Settings, Status
+from jaxtri.trajectory import Trajectory, evaluate
+
+
+def drifting(frames, *, seed=0, px=0.3):
+    """Tracks whose errors are walks, as those of optical flow are, and some of which slip."""
+    t = np.arange(frames)[:, None]
+    tracks = make(t * [0.04, 0.002, 0.006], t * [0.0, 0.002, 0.001], noise_px=0.0, seed=seed)
+    rng = np.random.default_rng(seed)
+    pixels = tracks.pixels + np.cumsum(rng.normal(scale=px / 3, size=tracks.pixels.shape), axis=0)
+    slips = rng.choice(pixels.shape[1], 12, replace=False)
+    pixels[frames // 2 :, slips] += rng.uniform(-15, 15, (12, 2))
+    return tracks._replace(pixels=pixels)
+
+
+def errors(tracks, trajectory):
+    truth = Trajectory(np.arange(len(tracks.R), dtype=float), tracks.T_world_camera)
+    return evaluate(trajectory, truth)
+
+
+@pytest.fixture(scope="module")
+def run():
+    tracks = drifting(40)
+    return tracks, follow_tracks(tracks.camera, tracks.pixels, tracks.visible, record=True)
+
+
+def test_refined_poses_are_nearer_and_the_rest_stays(run):
+    tracks, odometry = run
+    found = refine(odometry)
+    before, after = errors(tracks, odometry.trajectory()), errors(tracks, found.trajectory())
+    assert after.rpe_rotation_deg < 0.85 * before.rpe_rotation_deg
+    assert after.rpe_translation_percent < before.rpe_translation_percent
+    assert after.ate_percent < 0.1
+    assert [p.status for p in found.poses] == [p.status for p in odometry.poses]
+    assert found.keyframes[0] == odometry.base_pair[0]
+    assert found.keyframes[-1] == 39
+    assert 3 < len(found.keyframes) < 39
+    # The gauge: the first pose, and how far away the farthest keyframe is.
+    first = odometry.base_pair[0]
+    np.testing.assert_allclose(found.poses[first].T_camera_world, odometry.poses[first].T_camera_world, atol=1e-12)
+    lengths = [
+        np.linalg.norm(t.positions[39] - t.positions[first]) for t in (odometry.trajectory(), found.trajectory())
+    ]
+    np.testing.assert_allclose(*lengths, rtol=1e-9)
+    # Points: at least as near to where they are as the recursive ones.
+    points = found.points
+    truth = ((tracks.points - tracks.centres[0]) @ tracks.R[0].T)[points.ids]
+    scale = np.median(np.sum(truth * points.xyz, axis=1) / np.sum(points.xyz**2, axis=1))
+    assert np.median(np.linalg.norm(scale * points.xyz - truth, axis=1) / truth[:, 2]) < 0.01
+    assert len(np.unique(points.ids)) == len(points.ids) > 80
+    (part,) = found.statistics["parts"]
+    assert part["refined"]
+    assert part["converged"]
+
+
+def test_errors_are_as_large_as_they_are_said_to_be():
+    """NEES of every tenth frame, rotation and direction alone: the noise is learned, and assumed too large by far."""
+    nees = []
+    for seed in range(6):
+        tracks = drifting(40, seed=seed, px=0.1)
+        settings = Settings.of(tracks.camera, noise_px=0.4)
+        odometry = follow_tracks(tracks.camera, tracks.pixels, tracks.visible, settings=settings, record=True)
+        found = refine(odometry)
+        assert found.statistics["parts"][0]["noise_over_assumed"] < 0.5
+        for k in (12, 20, 28, 36):
+            pose = found.poses[k]
+            R = tracks.R[k] @ tracks.R[0].T @ pose.T_camera_world[:3, :3].T
+            theta = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+            nees.append(theta @ np.linalg.solve(pose.covariance[3:, 3:], theta))
+    assert 0.5 < np.mean(nees) / 3 < 3
+
+
+def test_long_sequences_are_cut_into_blocks(run, monkeypatch):
+    """The same run in blocks of four keyframes, tracks cut where they reach over more than two: nearly as good."""
+    tracks, odometry = run
+    whole = refine(odometry)
+    monkeypatch.setattr(stretches, "SMALL", 2)
+    monkeypatch.setattr(stretches, "BLOCK", 4)
+    cut = refine(odometry)
+    assert cut.statistics["parts"][0]["tracks"] > whole.statistics["parts"][0]["tracks"]
+    assert errors(tracks, cut.trajectory()).ate_percent < 1.5 * errors(tracks, whole.trajectory()).ate_percent + 0.02
+
+
+def test_each_stretch_is_refined_by_itself_and_hangs_on_the_one_before():
+    """The camera is lost, and found again: two parts."""
+    tracks = drifting(70, px=0.1)
+    pixels, visible = tracks.pixels.copy(), tracks.visible.copy()
+    visible[:, 64:] = False
+    visible[34:, :64] = False
+    again = sideways(36)
+    pixels[34:, 64:], visible[34:, 64:] = again.pixels[:, 64:], again.visible[:, 64:]
+    odometry = follow_tracks(tracks.camera, pixels, visible, record=True)
+    assert odometry.starts == 2
+    found = refine(odometry)
+    assert [p["refined"] for p in found.statistics["parts"]] == [True, True]
+    begun = next(k for k, p in enumerate(odometry.poses) if p.status is Status.RESTARTED)
+    # What stood between the two parts stands as it stood.
+    end = found.statistics["parts"][0]["frames"][1]
+    step = [p[begun].T_camera_world @ np.linalg.inv(p[end].T_camera_world) for p in (odometry.poses, found.poses)]
+    np.testing.assert_allclose(*step, atol=1e-9)
+
+
+def test_what_cannot_be_refined_says_so():
+    tracks = sideways(12)
+    with pytest.raises(InputError, match="record=True"):
+        refine(follow_tracks(tracks.camera, tracks.pixels, tracks.visible))
+    still = Odometry(tracks.camera, record=True)
+    for k in range(5):
+        still.add(tracks.pixels[0], tracks.visible[0], float(k))
+    with pytest.raises(InitialisationError, match="median flow"):
+        refine(still)
