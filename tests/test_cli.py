@@ -12,6 +12,7 @@ import pytest
 from jaxtri.cli import main
 from jaxtri.formats import read_tum
 from jaxtri.synthetic.rendered import write_laboratory
+from jaxtri.trajectory import evaluate
 from jaxtri.vision.video import write_video
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -183,8 +184,6 @@ def test_a_real_sequence_is_tracked_whole(tmp_path):
     source = DATA / "rig_temple"
     camera = str(source / "camera.json")
     main(["track", str(source), "--camera", camera, "--out", str(tmp_path), "--quiet", "--no-overlay"])
-    from jaxtri.trajectory import evaluate
-
     errors = evaluate(read_tum(tmp_path / "trajectory.txt"), read_tum(source / "groundtruth.txt"))
     assert errors.matched == 19
     assert errors.ate_percent < 1

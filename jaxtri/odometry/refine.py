@@ -66,7 +66,8 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
     """Bundle adjustment of a run: `Odometry(..., record=True)`, or `run.odometry` of `track(..., record=True)`.
 
     Where the camera was lost, each part is refined by itself. Its first pose stays, and so does its scale: the distance
-    from there to the keyframe that is farthest from it. Covariances are with respect to these two. Raises
+    from there to the keyframe that is farthest from it. Covariances are with respect to these two, by the noise that
+    is found where that is more than the one assumed. Raises
     `InputError` where no tracks were kept, `InitialisationError` where there is no pose.
     """
     if not odometry.record:
@@ -169,6 +170,7 @@ class _Adjusted:
             "converged": bool(now.converged),
             "noise_over_assumed": float(f"{np.sqrt(inflation):.3g}"),
         }
+        inflation = max(inflation, 1.0)
         spread = pieces.each(spread, (4, 3)) * np.sqrt(inflation)
         start = now.poses, covariance * inflation, inflation
         return cls(segment, keys, pieces, noise, float(depth), *start, X, spread, *looks, said)
@@ -211,7 +213,7 @@ class _Adjusted:
         )
         # The noise of what is new between two keyframes is another one, and is found from what these frames say.
         weights, measured = (1 + distance[mask] / scale) ** -2.0, mask.sum(axis=1)
-        inflation = _inflation(weights, scale, 1 - 3 * len(between) / max(mask.sum(), 1))
+        inflation = max(_inflation(weights, scale, 1 - 3 * len(between) / max(mask.sum(), 1)), 1.0)
         agree = mask & (distance < scale * inflation)
         distance = _over_found(distance, agree)
         covariance = inflation * own + owed
@@ -271,6 +273,8 @@ def _inflation(weights: np.ndarray, scale: float, free: float) -> float:
     That of an estimate by a robust cost is E[psi^2] / E[psi']^2 over the information of plain squares, psi the slope of
     the cost; the normal equations have E[w] in the place of both. `free` is the share of the residuals that the
     unknowns have not taken. Source: Huber 1981, section 6.3.
+
+    It only ever raises what was assumed: an error that neighbours share goes into the poses, and no residual shows it.
     """
     if not len(weights):
         return 1.0
