@@ -71,7 +71,7 @@ def main() -> None:
         for base in (Base.TRACKS, Base.PAPER):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                run, errors, coverage = run_sequence(folder, base)
+                run, errors, _, coverage = run_sequence(folder, base)
             prefix = "" if base is Base.TRACKS else "paper."
             figures |= {
                 f"{prefix}{folder.name}.coverage": coverage,

@@ -44,8 +44,8 @@ class Track:
     """Stop after so many frames."""
     place: tuple[float, float] | None = None
     """Where the car stands: pixel u v in the middle frame; on the dominant plane by default."""
-    refine: bool | None = None
-    """Adjust all keyframes together at the end: on for files, off for a camera."""
+    refine: bool = True
+    """Adjust all keyframes together at the end of a file; what a camera shows is left as it was followed."""
     overlay: bool = True
     """Write overlay.mp4."""
     recording: bool = False
@@ -133,7 +133,7 @@ def _track(options: Track) -> None:
         if live:
             warm_up(camera, **how)
         frames: Any = spool(source, options.out / "frames") if live else source
-        refine = not live if options.refine is None else options.refine
+        refine = options.refine and not live
         more = {"progress": not options.quiet, "max_frames": options.max_frames, "refine": refine}
         run = track(frames, camera, **more, **how)
         fps = source.fps
