@@ -45,8 +45,8 @@ class Refinement:
     """What all that was seen says of a run.
 
     Attributes:
-        poses: One `FramePose` a frame; its `nis` is by the noise that was found. A frame that the camera was not
-            followed in is as it was.
+        poses: One `FramePose` a frame; its `nis` is by the noise that was found, where that is more than the one
+            assumed. A frame that the camera was not followed in is as it was.
         points: The scene; covariances of each point's own error, the poses given.
         keyframes: Numbers of the frames that were adjusted together with the points.
         statistics: Figures, as `run.json` has them.
@@ -284,8 +284,8 @@ def _inflation(weights: np.ndarray, scale: float, free: float) -> float:
 
 
 def _over_found(distance: np.ndarray, agree: np.ndarray) -> np.ndarray:
-    """Squared distances in the mean of those that agree, so that this is 2, as of two components of right noise."""
-    return 2 * distance / max(float(distance[agree].mean()) if agree.any() else 2.0, TINY)
+    """Squared distances over the noise that those which agree have, where that is more than the one assumed."""
+    return 2 * distance / max(float(distance[agree].mean()) if agree.any() else 2.0, 2.0)
 
 
 _step, _known, _matrices = jax.jit(batch.step), jax.jit(batch.known), jax.jit(SE3.as_matrix)
