@@ -178,7 +178,7 @@ def relative_errors(
 
     R_estimate, t_estimate = motion(estimate)
     R_reference, t_reference = motion(reference)
-    return _norm(t_estimate - t_reference), _angle(R_reference.mT @ R_estimate)
+    return _norm(t_estimate - t_reference), angle(R_reference.mT @ R_estimate)
 
 
 def rotation_errors(
@@ -193,7 +193,7 @@ def rotation_errors(
     """
     if rotation is None:
         rotation = _closest_rotation(jnp.einsum("tij,tkj->ik", reference, estimate))
-    return _angle(reference.mT @ rotation @ estimate)
+    return angle(reference.mT @ rotation @ estimate)
 
 
 def nees(errors: Float[Array, "*batch d"], covariance: Float[Array, "*batch d d"]) -> Float[Array, "*batch"]:
@@ -340,7 +340,8 @@ def _vee(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
     return jnp.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
 
 
-def _angle(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
+def angle(R: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
+    """By how much rotation matrices turn, radians."""
     # Not arccos of the trace, which has half the digits, and no derivative, at small angles.
     return jnp.arctan2(_norm(_vee(R)), jnp.trace(R, axis1=-2, axis2=-1) - 1)
 

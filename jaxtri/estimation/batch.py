@@ -24,8 +24,10 @@ from jaxtri.estimation.bundle import (
     Reduced,
     Views,
     cost,
+    held,
     linearise,
     points_given,
+    projected,
     reduce,
     without_length,
 )
@@ -130,7 +132,7 @@ def step(batch: Batch, noise: Noise, now: Estimate, tolerance: Float[Array, ""] 
         return said.cost + _cost_of(part[0].prior, part[1]), reduced.information, reduced.pull
 
     each = _mapped(said, batch, now.points, now.poses)
-    equations = _held(batch, now.poses, _together([Tridiagonal.of(*x[1:]) for x in each]))
+    equations = _equations(batch, now.poses, (x[1:] for x in each))
     x = Factors.of(equations, now.damping).solve(equations.pull)
     poses = _moved(batch, now.poses, x.reshape(-1, 6))
 
@@ -206,8 +208,8 @@ def known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) ->
         return reduced.information, reduced.pull, KnownPoints(spread, said.residual, said.weights)
 
     information, pull, of_points = zip(*_mapped(chunk, batch, points, poses), strict=True)
-    equations = _together([Tridiagonal.of(*x) for x in zip(information, pull, strict=True)])
-    blocks = Factors.of(_held(batch, poses, equations), jnp.zeros((), noise.sigma.dtype)).covariances()
+    equations = _equations(batch, poses, zip(information, pull, strict=True))
+    blocks = Factors.of(equations, jnp.zeros((), noise.sigma.dtype)).covariances()
     free, b = _free(batch, poses), batch.layers[-1].size
     each = blocks.reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)].swapaxes(0, 1).reshape(-1, 6, 6)
     return Known(free @ each @ free, of_points)
@@ -224,9 +226,12 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
     poses, points = still(found.poses), still(found.points)
     free = _free(batch, poses)
 
+    def only(x: Array) -> Array:
+        return jnp.einsum("kab,kb->ka", free, x)
+
     def slope(errors: tuple, batch: Batch, noise: Noise) -> tuple:
         def objective(errors: tuple) -> Array:
-            moved = _moved(batch, poses, jnp.einsum("kab,kb->ka", free, errors[0]))
+            moved = _moved(batch, poses, only(errors[0]))
             new = tuple(jax.vmap(Points.moved)(p, e) for p, e in zip(points, errors[1], strict=True))
 
             def chunk(part: tuple) -> Array:
@@ -243,7 +248,7 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
 
     def curvature(direction: tuple) -> tuple:
         along = jax.jvp(lambda e: slope(e, *at), (zero,), (direction,))[1]
-        return along[0] + direction[0] - jnp.einsum("kab,kb->ka", free, direction[0]), along[1]
+        return along[0] + direction[0] - only(direction[0]), along[1]
 
     right = slope(zero, batch, noise)
     # In the coordinates that make those of Gauss and Newton the identity. As one vector, and compiled by itself: `cg`
@@ -260,15 +265,14 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
         return jax.scipy.sparse.linalg.cg(whitened, right, tol=tolerance, maxiter=MOST)[0]
 
     newton = root(tree(solve(flat)))
-    x = -jnp.einsum("kab,kb->ka", free, newton[0])
     new = tuple(jax.vmap(Points.moved)(p, -e) for p, e in zip(points, newton[1], strict=True))
-    return _moved(batch, poses, x), new
+    return _moved(batch, poses, -only(newton[0])), new
 
 
 def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Callable[[tuple], tuple]:
     """S with S' H S = I, H the matrix of Gauss and Newton for poses and points."""
     reduced = _mapped(lambda part: _said(noise, part)[1], batch, points, poses)
-    equations = _held(batch, poses, _together([Tridiagonal.of(r.information, r.pull) for r in reduced]))
+    equations = _equations(batch, poses, ((r.information, r.pull) for r in reduced))
     factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
 
     def root(white: tuple) -> tuple:
@@ -318,12 +322,15 @@ def pairs(size: int, each: Any) -> Any:
     return jax.tree.map(pair, each)
 
 
-def _together(layers: list[Tridiagonal]) -> Tridiagonal:
-    """What all layers say, in the blocks of the last."""
-    total = layers[0]
-    for layer in layers[1:]:
+def _equations(batch: Batch, poses: SE3, said: Iterable[tuple[Array, Array]]) -> Tridiagonal:
+    """What all layers say, information and pull of each chunk, in the blocks of the last, with the gauge held."""
+    first, *others = (Tridiagonal.of(*layer) for layer in said)
+    total = first
+    for layer in others:
         total = jax.tree.map(jnp.add, total.coarser(layer.pull.shape[1] // total.pull.shape[1]), layer)
-    return total
+    free = _free(batch, poses).reshape(-1, batch.layers[-1].size, 6, 6)
+    diagonal, pull = jax.vmap(held)(free, total.diagonal, total.pull)
+    return Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], total.above, free[1:]), pull)
 
 
 def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:
@@ -352,22 +359,3 @@ def _free(batch: Batch, poses: SE3) -> Float[Array, "k 6 6"]:
         return jnp.where(present & (index > 0), free, 0.0)
 
     return jax.vmap(one)(jnp.arange(k), batch.present, poses)
-
-
-def _held(batch: Batch, poses: SE3, equations: Tridiagonal) -> Tridiagonal:
-    """The equations whose solution has no other errors than those that are free."""
-    b = batch.layers[-1].size
-    free = _free(batch, poses).reshape(-1, b, 6, 6)
-
-    def projected(left: Array, A: Array, right: Array) -> Array:
-        return jnp.einsum("kab,kblc,lcd->kald", left, A.reshape(b, 6, b, 6), right).reshape(6 * b, 6 * b)
-
-    diagonal = jax.vmap(projected)(free, equations.diagonal, free)
-    above = jax.vmap(projected)(free[:-1], equations.above, free[1:])
-    size = jnp.diagonal(equations.diagonal, axis1=1, axis2=2).reshape(-1, b, 6).mean(axis=2)
-    # What is not free gets information of its own: as much as the rest of its pose, so that all stay of one scale.
-    rest = (jnp.eye(6, dtype=size.dtype) - free) * jnp.where(size > 0, size, 1.0)[..., None, None]
-    eye = jnp.eye(b, dtype=size.dtype)
-    rest = (rest[:, :, :, None] * eye[:, None, :, None]).reshape(-1, 6 * b, 6 * b)
-    pull = jnp.einsum("mkab,mkb->mka", free, equations.pull.reshape(-1, b, 6)).reshape(equations.pull.shape)
-    return Tridiagonal(diagonal + rest, above, pull)

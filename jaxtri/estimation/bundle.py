@@ -337,6 +337,24 @@ def without_length(between: Float[Array, "3"]) -> Float[Array, "6 6"]:
     return jnp.eye(6, dtype=between.dtype) - jnp.pad(along, (0, 3))
 
 
+def projected(left: Float[Array, "k 6 6"], A: Float[Array, "s s"], right: Float[Array, "k 6 6"]) -> Float[Array, "s s"]:
+    """A matrix of k poses by k, projected pose by pose from both sides."""
+    k = len(left)
+    return jnp.einsum("kab,kblc,lcd->kald", left, A.reshape(k, 6, k, 6), right).reshape(6 * k, 6 * k)
+
+
+def held(
+    free: Float[Array, "k 6 6"], information: Float[Array, "s s"], pull: Float[Array, " s"]
+) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+    """Normal equations whose solution has no other errors than those that are `free`: projections, pose by pose."""
+    k = len(free)
+    size = jnp.trace(information.reshape(k, 6, k, 6).diagonal(axis1=0, axis2=2)) / 6
+    # What is not free gets information of its own: as much as the rest of its pose, so that all stay of one scale.
+    rest = (jnp.eye(6, dtype=pull.dtype) - free) * jnp.where(size > 0, size, 1.0)[:, None, None]
+    pull = jnp.einsum("kab,kb->ka", free, pull.reshape(k, 6)).reshape(6 * k)
+    return projected(free, information, free) + block_diagonal(rest), pull
+
+
 def block_diagonal(each: Float[Array, "k e e"]) -> Float[Array, "s s"]:
     """The matrix that has these blocks on its diagonal."""
     k, e, _ = each.shape

@@ -35,7 +35,7 @@ from jaxtri.trajectory import Trajectory
 CATCH_UP = 2  # frames taken in for each that comes, where some came while a start was worked out
 AGAIN = 1.1  # flow, over that of the last attempt, from which a start from the same first frame is tried again
 
-_normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
+normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
 
 
 class _Begun(NamedTuple):
@@ -252,7 +252,7 @@ class Odometry(Archived):
         held = np.full(self.capacity, -1) if self._held is None else self._held
         tracks = slotted(held, z, seen, rows, known)
         dtype = self._settings.sigma.dtype
-        u = np.asarray(_normalise(self.camera, tracks.pixels.astype(dtype)))
+        u = np.asarray(normalise(self.camera, tracks.pixels.astype(dtype)))
         tracks = tracks._replace(visible=tracks.visible & np.isfinite(u).all(axis=1))
         quality = tracks.quality.astype(dtype)
         return Observations(index, float(time), u, tracks.visible, tracks.ids, quality), tracks, rows

@@ -31,7 +31,7 @@ from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.stretches import Pieces, Segment, blocks, keyframes, segments
 from jaxtri.odometry.structure import Points, world_points
-from jaxtri.odometry.window import AGREES, FAREST, NEAREST, VAGUE
+from jaxtri.odometry.window import FAREST, NEAREST, VAGUE
 from jaxtri.trajectory import Trajectory
 
 FEWEST = 3  # keyframes that there must be: two are what a start has made of them
@@ -66,9 +66,9 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
     """Bundle adjustment of a run: `Odometry(..., record=True)`, or `run.odometry` of `track(..., record=True)`.
 
     Where the camera was lost, each part is refined by itself. Its first pose stays, and so does its scale: the distance
-    from there to the keyframe that is farthest from it. Covariances are with respect to these two, by the noise that
-    is found where that is more than the one assumed. Raises
-    `InputError` where no tracks were kept, `InitialisationError` where there is no pose.
+    from there to the keyframe that is farthest from it. Covariances are with respect to these two, by the noise that is
+    found where that is more than the one assumed. Raises `InputError` where no tracks were kept, `InitialisationError`
+    where there is no pose.
     """
     if not odometry.record:
         raise InputError("nothing was recorded: ask for it by record=True")
@@ -124,11 +124,11 @@ class _Adjusted:
     depth: float
     poses: SE3
     covariance: np.ndarray  # (k, 6, 6)
-    inflation: float  # of the variances that were assumed, by what the residuals say
     X: np.ndarray  # (p, 4) homogeneous points
     spread: np.ndarray  # (p, 4, 3) their own errors, over sigma
+    agreed: np.ndarray  # (p,) points that at least two looks agree on
     residual: np.ndarray  # (o, 2) of the looks, over sigma
-    weights: np.ndarray  # (o,)
+    distance: np.ndarray  # (o,) of what is new in them, squared, over the noise that is taken for theirs
     statistics: dict[str, object]
 
     @classmethod
@@ -157,11 +157,12 @@ class _Adjusted:
             return None
         X = pieces.each([np.asarray(p.X) for p in now.points], (4,))
         spread, residual, weights = ([np.asarray(x) for x in y] for y in zip(*known.points, strict=True))
-        looks = pieces.looks(residual, (2,)), pieces.looks(weights, ())
-        agree = looks[1] > AGREES
-        points = (np.bincount(pieces.piece[agree], minlength=len(pieces.ids)) > 1).sum()
-        free = 1 - (3 * points + 6 * len(keys)) / (2 * max(int(agree.sum()), 1))
-        inflation = _inflation(looks[1], float(noise.scale), free)
+        scale = float(noise.scale)
+        distance = scale * (1 / np.sqrt(np.maximum(pieces.looks(weights, ()), TINY)) - 1)
+        agree = distance < scale
+        agreed = np.bincount(pieces.piece[agree], minlength=len(pieces.ids)) > 1
+        free = 1 - (3 * agreed.sum() + 6 * len(keys)) / (2 * max(int(agree.sum()), 1))
+        inflation = _inflation(distance, scale, free)
         said = {
             "keyframes": len(keys),
             "tracks": len(pieces.ids),
@@ -172,8 +173,9 @@ class _Adjusted:
         }
         inflation = max(inflation, 1.0)
         spread = pieces.each(spread, (4, 3)) * np.sqrt(inflation)
-        start = now.poses, covariance * inflation, inflation
-        return cls(segment, keys, pieces, noise, float(depth), *start, X, spread, *looks, said)
+        poses = now.poses, covariance * inflation
+        looks = pieces.looks(residual, (2,)), distance / inflation
+        return cls(segment, keys, pieces, noise, float(depth), *poses, X, spread, agreed, *looks, said)
 
     def points(self, settings: Settings, moved: np.ndarray) -> Points:
         """The points that at least two looks agree on, in a world that has been moved."""
@@ -181,29 +183,24 @@ class _Adjusted:
         pad = np.zeros(capacity(count) - count, int)  # each length is compiled once
         items = BasePoint(*(jnp.asarray(np.concatenate([x, x[pad]])) for x in (self.X, self.spread)))
         xyz, covariance, known = (np.asarray(x)[:count] for x in world_points(items, settings))
-        agree = np.bincount(self.pieces.piece[self.weights > AGREES], minlength=count) > 1
-        good = agree & known & np.isfinite(xyz).all(axis=1)
+        good = self.agreed & known & np.isfinite(xyz).all(axis=1)
         R, t = moved[:3, :3], moved[:3, 3]
         # A pose becomes T moved, so a point of the world its inverse of it.
         return Points(self.pieces.ids[good], (xyz[good] - t) @ R, R.T @ covariance[good] @ R)
 
     def frames(self, settings: Settings, before: list[FramePose]) -> list[FramePose]:
         """The poses of all frames, `before` what they were."""
-        found, T, count, scale = (
-            list(before),
-            np.asarray(_matrices(self.poses)),
-            len(self.keys),
-            float(self.noise.scale),
-        )
-        distance = scale * (1 / np.sqrt(np.maximum(self.weights, TINY)) - 1) / self.inflation
-        agree = distance < scale
-        distance = _over_found(distance, agree)
-        measured = np.bincount(self.pieces.key, minlength=count)
-        used = np.bincount(self.pieces.key[agree], minlength=count)
-        nis = np.bincount(self.pieces.key[agree], weights=distance[agree], minlength=count)
-        for i, k in enumerate(self.keys):
-            counts = int(used[i]), float(nis[i]), int(measured[i])
-            found[k] = _judged(before[k], T[i], self.covariance[i], *counts)
+        found, count, scale = list(before), len(self.keys), float(self.noise.scale)
+
+        def put(at: np.ndarray, T: np.ndarray, covariance: np.ndarray, *numbers: np.ndarray) -> None:
+            for k, pose, C, used, nis, measured in zip(at, T, covariance, *(x.tolist() for x in numbers), strict=True):
+                found[k] = _judged(before[k], pose, C, used, nis, measured)
+
+        key, agree = self.pieces.key, self.distance < scale
+        distance = _over_found(self.distance, agree)
+        used, measured = (np.bincount(x, minlength=count) for x in (key[agree], key))
+        nis = np.bincount(key[agree], weights=distance[agree], minlength=count)
+        put(self.keys, np.asarray(_matrices(self.poses))[:count], self.covariance, used, nis, measured)
         between = np.setdiff1d(np.arange(len(before)), self.keys)
         if not len(between):
             return found
@@ -212,15 +209,10 @@ class _Adjusted:
             np.concatenate, zip(*(self._between(settings, g) for g in groups), strict=True)
         )
         # The noise of what is new between two keyframes is another one, and is found from what these frames say.
-        weights, measured = (1 + distance[mask] / scale) ** -2.0, mask.sum(axis=1)
-        inflation = max(_inflation(weights, scale, 1 - 3 * len(between) / max(mask.sum(), 1)), 1.0)
+        inflation = max(_inflation(distance[mask], scale, 1 - 3 * len(between) / max(mask.sum(), 1)), 1.0)
         agree = mask & (distance < scale * inflation)
-        distance = _over_found(distance, agree)
-        covariance = inflation * own + owed
-        used, nis = agree.sum(axis=1), np.where(agree, distance, 0.0).sum(axis=1)
-        for i, k in enumerate(between):
-            counts = int(used[i]), float(nis[i]), int(measured[i])
-            found[k] = _judged(before[k], T[i], covariance[i], *counts)
+        nis = np.where(agree, _over_found(distance, agree), 0.0).sum(axis=1)
+        put(between, T, inflation * own + owed, agree.sum(axis=1), nis, mask.sum(axis=1))
         return found
 
     def _between(self, settings: Settings, frames: np.ndarray) -> list[np.ndarray]:
@@ -267,19 +259,21 @@ class _Adjusted:
         return which, kept, (1 - a**2) * (1 - b**2) / whole
 
 
-def _inflation(weights: np.ndarray, scale: float, free: float) -> float:
+def _inflation(distance: np.ndarray, scale: float, free: float) -> float:
     """By how much the variance of an estimate is above what the assumed noise makes it.
 
     That of an estimate by a robust cost is E[psi^2] / E[psi']^2 over the information of plain squares, psi the slope of
-    the cost; the normal equations have E[w] in the place of both. `free` is the share of the residuals that the
+    the cost; the normal equations have E[w] in the place of both. `distance` are the squares of the residuals over what
+    was assumed, each of two components, `scale` is that of the weights. `free` is the share of the residuals that the
     unknowns have not taken. Source: Huber 1981, section 6.3.
 
     It only ever raises what was assumed: an error that neighbours share goes into the poses, and no residual shows it.
     """
-    if not len(weights):
+    if not len(distance):
         return 1.0
-    root = np.sqrt(np.maximum(weights, TINY))
-    squared, slope, mean = weights**2 * scale * (1 / root - 1) / 2, weights * (2 * root - 1), weights.mean()
+    root = 1 / (1 + distance / scale)
+    weights = root**2
+    squared, slope, mean = weights**2 * distance / 2, weights * (2 * root - 1), weights.mean()
     return float(squared.mean() * mean / max(slope.mean(), mean / 10) ** 2 / max(free, 0.1))
 
 

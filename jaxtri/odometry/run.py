@@ -9,6 +9,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -23,7 +24,7 @@ from jaxtri.odometry.refine import Refinement
 from jaxtri.odometry.refine import refine as refine_run
 from jaxtri.odometry.settings import Base, Settings, StartSettings
 from jaxtri.odometry.structure import Points
-from jaxtri.trajectory import Trajectory
+from jaxtri.trajectory import Trajectory, angle
 from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
 from jaxtri.vision.video import Frame, FrameSource, ahead
 
@@ -119,16 +120,20 @@ def track(
         bar.close()
     if len(odometry.poses) < 2:
         raise InputError(f"{len(odometry.poses)} frame: a camera's motion needs at least two")
-    best, refined = (odometry.trajectory(), odometry.points()), None
+    causal, refined = odometry.trajectory(), None
     clock.end()
+    best = causal
     if refine:
         with clock.part("refinement"):
             refined = refine_run(odometry, progress=progress)
-            best = refined.trajectory(), refined.points
+            best = refined.trajectory()
+    points = odometry.points() if refined is None else refined.points
     grey = np.full(3, 128, np.uint8)
-    rgb = np.array([colours.get(int(i), grey) for i in best[1].ids], np.uint8).reshape(-1, 3)
-    statistics = _statistics(odometry, refined) | clock.statistics() | {"interrupted": interrupted}
-    return Run(*best, rgb, odometry, statistics, refined)
+    rgb = np.array([colours.get(int(i), grey) for i in points.ids], np.uint8).reshape(-1, 3)
+    change = None if refined is None else refined.statistics | _change(causal, best)
+    poses = odometry.poses if refined is None else refined.poses
+    statistics = _statistics(odometry, poses) | clock.statistics() | {"interrupted": interrupted, "refined": change}
+    return Run(best, points, rgb, odometry, statistics, refined)
 
 
 class _Clock:
@@ -268,8 +273,7 @@ def _figures(values: Iterable[float]) -> list[float]:
     return [float(f"{x:.4g}") for x in values]
 
 
-def _statistics(odometry: Odometry, refined: Refinement | None) -> dict[str, object]:
-    poses = odometry.poses if refined is None else refined.poses
+def _statistics(odometry: Odometry, poses: list[FramePose]) -> dict[str, object]:
     status = Counter(p.status.name.lower() for p in poses)
     used = [p.used for p in poses if p.status.measured]
     return {
@@ -291,15 +295,12 @@ def _statistics(odometry: Odometry, refined: Refinement | None) -> dict[str, obj
         "base_pair": odometry.base_pair,
         "keyframes": odometry.keyframes,
         "points_used_per_frame": float(np.mean(used)) if used else 0.0,
-        "refined": None if refined is None else refined.statistics | _change(odometry, refined),
     }
 
 
-def _change(odometry: Odometry, refined: Refinement) -> dict[str, float]:
+def _change(before: Trajectory, after: Trajectory) -> dict[str, float]:
     """How far refinement has moved the frames: root mean squares, positions over the length of the path."""
-    before, after = odometry.trajectory(), refined.trajectory()
     length, shift = before.path_length, np.linalg.norm(after.positions - before.positions, axis=1)
-    turn = np.einsum("tij,tij->t", before.T_world_camera[:, :3, :3], after.T_world_camera[:, :3, :3])
-    angle = np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1)))
-    moved, turned = (float(np.sqrt(np.mean(x**2))) for x in (shift, angle))
+    turn = np.degrees(angle(jnp.asarray(np.swapaxes(before.rotations, 1, 2) @ after.rotations)))
+    moved, turned = (float(np.sqrt(np.mean(x**2))) for x in (shift, turn))
     return {"moved_percent_of_path": 100 * moved / length if length else 0.0, "turned_deg": turned}

@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.driver import Odometry, normalise
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.slots import Slotted
 
@@ -42,7 +41,7 @@ class Segment(NamedTuple):
         """Of frames of a run, as it recorded them."""
         tracks: list[Slotted] = odometry.tracks[first:end]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
-        u = np.stack([np.asarray(_normalise(odometry.camera, t.pixels.astype(dtype))) for t in tracks])
+        u = np.stack([np.asarray(normalise(odometry.camera, t.pixels.astype(dtype))) for t in tracks])
         seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
         poses = odometry.poses[first:end]
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -55,9 +54,6 @@ class Segment(NamedTuple):
             times,
             np.array([p.status.measured for p in poses]),
         )
-
-
-_normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
 
 
 def keyframes(settings: Settings, segment: Segment) -> np.ndarray:

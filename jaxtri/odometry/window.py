@@ -21,8 +21,10 @@ from jaxtri.estimation.bundle import (
     Reduced,
     Views,
     block_diagonal,
+    held,
     linearise,
     looks,
+    projected,
     reduce,
     seen_from,
     solver,
@@ -193,8 +195,8 @@ def _improved(
         reduced = reduce(said, points, vague)
         carried = information, pull = _carried(window, poses)
         free = _free(window, poses)
-        held = _held(free, information + reduced.information, pull + reduced.pull)
-        return _Estimate(poses, points, said, reduced, free, *held, carried, damping)
+        equations = held(free, information + reduced.information, pull + reduced.pull)
+        return _Estimate(poses, points, said, reduced, free, *equations, carried, damping)
 
     # Every step is taken: one that is taken or not by its cost would make steps in the result's derivative.
     def step(best: _Estimate, _: None) -> tuple[_Estimate, None]:
@@ -209,7 +211,7 @@ def _improved(
     begin = begin._replace(poses=window.poses, points=points, information=jnp.eye(6 * k, dtype=dtype), damping=damping)
     best, _ = jax.lax.scan(step, begin, None, length=steps + 1)
     covariance = solver(best.information)(jnp.eye(6 * k, dtype=dtype))
-    covariance = _projected(best.free, (covariance + covariance.T) / 2)
+    covariance = projected(best.free, (covariance + covariance.T) / 2, best.free)
     spread = jnp.einsum("qsn,tsn->qtn", best.points.basis, best.reduced.root) / settings.sigma
     lever = best.reduced.cross * settings.sigma
     agree = jnp.sum(best.said.weights > AGREES, axis=0) >= 2
@@ -250,7 +252,7 @@ def _left(
     rows = (6 * order[:, None] + jnp.arange(6)).reshape(-1)
     information, pull = information[rows[:, None], rows], pull[rows]
     others = jnp.broadcast_to(jnp.eye(6, dtype=pull.dtype), (k - 1, 6, 6))
-    marginal = _without_first(*_held(jnp.concatenate([best.free[gone][None], others]), information, pull))
+    marginal = _without_first(*held(jnp.concatenate([best.free[gone][None], others]), information, pull))
     information, pull = (jnp.where(leaving, a, b) for a, b in zip(marginal, (information, pull), strict=True))
     mask = mask[order]
     return window._replace(
@@ -278,23 +280,6 @@ def _free(window: Window, poses: SE3) -> Float[Array, "k 6 6"]:
         return jnp.where(empty | (role == 1), none, jnp.where(role == 2, second, all_))
 
     return jax.vmap(one)(window.role, jnp.arange(k) < k - window.kept, poses)
-
-
-def _projected(free: Float[Array, "k 6 6"], A: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    k = len(free)
-    return jnp.einsum("kab,kblc,lcd->kald", free, A.reshape(k, 6, k, 6), free).reshape(6 * k, 6 * k)
-
-
-def _held(
-    free: Float[Array, "k 6 6"], information: Float[Array, "s s"], pull: Float[Array, " s"]
-) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
-    """Normal equations whose solution has no other errors than those that are `free`."""
-    k = len(free)
-    size = jnp.trace(information.reshape(k, 6, k, 6).diagonal(axis1=0, axis2=2)) / 6
-    # What is not free gets information of its own: as much as the rest of its pose, so that all stay of one scale.
-    rest = (jnp.eye(6, dtype=pull.dtype) - free) * jnp.where(size > 0, size, 1.0)[:, None, None]
-    pull = jnp.einsum("kab,kb->ka", free, pull.reshape(k, 6)).reshape(6 * k)
-    return _projected(free, information) + block_diagonal(rest), pull
 
 
 def _without_first(information: Float[Array, "s s"], pull: Float[Array, " s"]) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from intervals import nees_interval
 from jaxlie import SE3
 
 from jaxtri.estimation import batch
@@ -140,8 +141,6 @@ def test_exact_points_lead_back_to_the_path():
 
 def test_covariances_are_those_of_the_errors():
     """NEES of the newest pose and of one in the middle over many noises, as correlated as they are taken to be."""
-    from intervals import nees_interval
-
     problem, poses, _ = made()
     draws = 60
     batches = [made(noise=1.0, seed=k)[0] for k in range(draws)]
