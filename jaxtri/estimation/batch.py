@@ -2,9 +2,10 @@
 
 Keyframes stand in blocks. A chunk of tracks are those that begin in one block and are followed to the end of the next:
 so what a chunk says concerns two blocks in a row, the normal equations of the poses are block tridiagonal, and time and
-memory grow with the length of the sequence alone. Chunks are worked out one after the other. Most tracks are short, and
-in a large block they would be mostly empty places: so there are several layers of chunks, of smaller and larger blocks,
-and each track is in the first that holds it. In the last one tracks are cut.
+memory grow with the length of the sequence alone. Most tracks are short, and in a large block they would be mostly
+empty places: so there are several layers of chunks, of smaller and larger blocks, and each track is in the first that
+holds it. In the last one tracks are cut. Chunks of a layer are all of one size and are worked out one after the other,
+as many as there are: so sequences of different length share what is compiled.
 Source: Triggs et al. 2000, sections 6 and 7.
 """
 
@@ -21,7 +22,6 @@ from jaxtri.estimation.bundle import (
     Linearised,
     PointPrior,
     Points,
-    Reduced,
     Views,
     cost,
     held,
@@ -42,16 +42,20 @@ LEAST, HOPELESS = 1e-9, 1e6  # damping: no less; from here on no step can lower 
 
 
 class Layer(NamedTuple):
-    """Chunks of tracks: c of them, n tracks each, a chunk from 2 b keyframes, beginning every b.
+    """Chunks of tracks: room for c of them, n tracks each, a chunk from 2 b keyframes.
 
     Attributes:
         observed: (c, 2, 2 b, n) normalised image points.
         mask: (c, 2 b, n) which of them are seen.
+        begin: (c,) keyframe that a chunk begins with, a multiple of b.
+        count: Chunks that there are; those after them are empty.
         prior: Of the inverse depths, (c, n) each.
     """
 
     observed: Float[Array, "c 2 v n"]
     mask: Bool[Array, "c v n"]
+    begin: Int[Array, " c"]
+    count: Int[Array, ""]
     prior: PointPrior
 
     @property
@@ -59,12 +63,46 @@ class Layer(NamedTuple):
         """Keyframes in a block."""
         return self.mask.shape[1] // 2
 
+    def chunk(self, index: Int[Array, ""] | int) -> "Chunk":
+        """One of them."""
+        return Chunk(*(jax.tree.map(lambda x: x[index], each) for each in (*self[:3], self.prior)))
+
+
+class Chunk(NamedTuple):
+    """A chunk of a `Layer`: its fields without the first axis."""
+
+    observed: Float[Array, "2 v n"]
+    mask: Bool[Array, "v n"]
+    begin: Int[Array, ""]
+    prior: PointPrior
+
+    def of(self, each: Any) -> Any:
+        """What it needs of something of every keyframe."""
+        v = len(self.mask)
+        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, self.begin, v), each)
+
+    def views(self, noise: "Noise") -> Views:
+        """What is seen in it."""
+        return Views(self.observed, self.mask, noise.correlation)
+
+    def said(self, noise: "Noise", poses: SE3, points: Points) -> Linearised:
+        """By the observations."""
+        return linearise(self.of(poses), points, self.views(noise), *noise[:2])
+
+    def cost(self, noise: "Noise", poses: SE3, points: Points) -> Float[Array, ""]:
+        """Of the observations and the prior."""
+        return cost(self.of(poses), points, self.views(noise), *noise[:2]) + self.owed(points)
+
+    def owed(self, points: Points) -> Float[Array, ""]:
+        """To the prior."""
+        return jnp.sum(((self.prior.mean - points.inverse_depth) / self.prior.sd) ** 2)
+
 
 class Batch(NamedTuple):
     """What is seen from k keyframes.
 
     Attributes:
-        layers: Blocks of each are several of the one before; k is (c + 1) b in all of them.
+        layers: Blocks of each are several of the one before; k is at least two of the last ones.
         present: (k,) places that a keyframe stands in; the first one does, and its pose is given.
         farthest: Keyframe whose distance from the first is given: the unit of length.
     """
@@ -127,24 +165,18 @@ def step(batch: Batch, noise: Noise, now: Estimate, tolerance: Float[Array, ""] 
     their components; and that is judged by the noise that is found, not by the one assumed.
     """
 
-    def said(part: tuple) -> tuple:
-        said, reduced = _said(noise, part, now.damping)
-        return said.cost + _cost_of(part[0].prior, part[1]), reduced.information, reduced.pull
-
-    each = _mapped(said, batch, now.points, now.poses)
-    equations = _equations(batch, now.poses, (x[1:] for x in each))
+    before, equations = _equations(batch, noise, now.poses, now.points, now.damping)
     x = Factors.of(equations, now.damping).solve(equations.pull)
-    poses = _moved(batch, now.poses, x.reshape(-1, 6))
+    each = x.reshape(-1, 6)
+    poses = _moved(batch, now.poses, each)
 
-    def moved(part: tuple) -> tuple[Points, Array]:
-        layer, points, before, after, x = part
-        views = _views(layer, noise)
-        said = linearise(before, points, views, *noise[:2])
-        points = points.moved(points_given(said, points, layer.prior, x, now.damping))
-        return points, cost(after, points, views, *noise[:2]) + _cost_of(layer.prior, points)
+    def moved(chunk: Chunk, points: Points) -> tuple[Points, Array]:
+        said = chunk.said(noise, now.poses, points)
+        points = points.moved(points_given(said, points, chunk.prior, chunk.of(each), now.damping))
+        return points, chunk.cost(noise, poses, points)
 
-    points, after = zip(*_mapped(moved, batch, now.points, now.poses, poses, x.reshape(-1, 6)), strict=True)
-    before, after = _sum(x[0] for x in each), _sum(after)
+    points, after = zip(*_mapped(moved, batch, now.points), strict=True)
+    after = _sum(after)
     better = after <= before
     taken, left = (poses, points, after), (now.poses, now.points, before)
     poses, points, least = jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, left)
@@ -202,17 +234,17 @@ class KnownPoints(NamedTuple):
 def known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Known:
     """The covariances at an estimate."""
 
-    def chunk(part: tuple) -> tuple[Array, Array, KnownPoints]:
-        said, reduced = _said(noise, part)
-        spread = jnp.einsum("qsn,tsn->qtn", part[1].basis, reduced.root) / noise.sigma
-        return reduced.information, reduced.pull, KnownPoints(spread, said.residual, said.weights)
+    def one(chunk: Chunk, points: Points) -> KnownPoints:
+        said = chunk.said(noise, poses, points)
+        root = reduce(said, points, chunk.prior).root
+        spread = jnp.einsum("qsn,tsn->qtn", points.basis, root) / noise.sigma
+        return KnownPoints(spread, said.residual, said.weights)
 
-    information, pull, of_points = zip(*_mapped(chunk, batch, points, poses), strict=True)
-    equations = _equations(batch, poses, zip(information, pull, strict=True))
+    _, equations = _equations(batch, noise, poses, points)
     blocks = Factors.of(equations, jnp.zeros((), noise.sigma.dtype)).covariances()
     free, b = _free(batch, poses), batch.layers[-1].size
     each = blocks.reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)].swapaxes(0, 1).reshape(-1, 6, 6)
-    return Known(free @ each @ free, of_points)
+    return Known(free @ each @ free, tuple(_mapped(one, batch, points)))
 
 
 def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 1e-9) -> tuple[SE3, tuple[Points, ...]]:
@@ -234,11 +266,16 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
             moved = _moved(batch, poses, only(errors[0]))
             new = tuple(jax.vmap(Points.moved)(p, e) for p, e in zip(points, errors[1], strict=True))
 
-            def chunk(part: tuple) -> Array:
-                layer, points, pair = part
-                return cost(pair, points, _views(layer, noise), *noise[:2]) + _cost_of(layer.prior, points)
+            # Those behind the last one too: a loop of as many as there are has no reverse derivative.
+            def of_layer(layer: Layer, points: Points) -> Array:
+                @jax.checkpoint
+                def one(part: tuple[Array, Points]) -> Array:
+                    index, points = part
+                    return jnp.where(index < layer.count, layer.chunk(index).cost(noise, moved, points), 0.0)
 
-            return _sum(_mapped(jax.checkpoint(chunk), batch, new, moved)) / 2
+                return jax.lax.map(one, (jnp.arange(len(layer.mask)), points))
+
+            return _sum(map(of_layer, batch.layers, new)) / 2
 
         return jax.grad(objective)(errors)
 
@@ -271,16 +308,22 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
 
 def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Callable[[tuple], tuple]:
     """S with S' H S = I, H the matrix of Gauss and Newton for poses and points."""
-    reduced = _mapped(lambda part: _said(noise, part)[1], batch, points, poses)
-    equations = _equations(batch, poses, ((r.information, r.pull) for r in reduced))
+
+    def one(chunk: Chunk, points: Points) -> tuple[Array, Array]:
+        reduced = reduce(chunk.said(noise, poses, points), points, chunk.prior)
+        return reduced.root, reduced.cross
+
+    _, equations = _equations(batch, noise, poses, points)
     factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
+    reduced = _mapped(one, batch, points)
 
     def root(white: tuple) -> tuple:
         x = factors.up(white[0].reshape(equations.pull.shape)).reshape(white[0].shape)
         new = []
-        for layer, r, w in zip(batch.layers, reduced, white[1], strict=True):
-            own = w - jnp.einsum("cetn,ce->ctn", r.cross, pairs(layer.size, x).reshape(len(w), -1))
-            new.append(jnp.einsum("ctsn,ctn->csn", r.root, own))
+        for layer, (root, cross), w in zip(batch.layers, reduced, white[1], strict=True):
+            here = jax.vmap(lambda c, layer=layer: layer.chunk(c).of(x))(jnp.arange(len(w)))
+            own = w - jnp.einsum("cetn,ce->ctn", cross, here.reshape(len(w), -1))
+            new.append(jnp.einsum("ctsn,ctn->csn", root, own))
         return x, tuple(new)
 
     return root
@@ -290,47 +333,58 @@ def _sum(each: Iterable[Array]) -> Float[Array, ""]:
     return jnp.sum(jnp.concatenate(list(each)))
 
 
-def _views(layer: Layer, noise: Noise) -> Views:
-    return Views(layer.observed, layer.mask, noise.correlation)
+def _mapped(function: Callable[[Chunk, Points], Any], batch: Batch, points: tuple[Points, ...]) -> list:
+    """What a function gives of each chunk and its points, layer by layer; zeros for chunks that there are not."""
+
+    def of_layer(layer: Layer, points: Points) -> Any:
+        def one(index: Array | int) -> Any:
+            return function(layer.chunk(index), jax.tree.map(lambda x: x[index], points))
+
+        def put(index: Array, found: Any) -> Any:
+            return jax.tree.map(lambda x, y: x.at[index].set(y), found, one(index))
+
+        room = len(layer.mask)
+        empty = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(one, 0))
+        return jax.lax.fori_loop(0, layer.count, put, empty)
+
+    return [of_layer(layer, p) for layer, p in zip(batch.layers, points, strict=True)]
 
 
-def _said(noise: Noise, part: tuple, damping: Float[Array, ""] | float = 0.0) -> tuple[Linearised, Reduced]:
-    layer, points, pair = part
-    said = linearise(pair, points, _views(layer, noise), *noise[:2])
-    return said, reduce(said, points, layer.prior, damping=damping)
+def _equations(
+    batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], damping: Float[Array, ""] | float = 0.0
+) -> tuple[Float[Array, ""], Tridiagonal]:
+    """The cost, and what all chunks say of the poses, in the blocks of the last layer, with the gauge held."""
+    size, dtype = batch.layers[-1].size, noise.sigma.dtype
+    m, s = len(batch.present) // size, 6 * size
+    # Of each block what it has with itself, the upper half, and with the next.
+    total = jnp.zeros((), dtype), jnp.zeros((m, s, 2 * s), dtype), jnp.zeros(m * s, dtype)
 
+    def plus(rows: Array, more: Array, begin: Array) -> Array:
+        at = begin // size, 6 * (begin % size), 6 * (begin % size)
+        old = jax.lax.dynamic_slice(rows, at, (1, *more.shape))
+        return jax.lax.dynamic_update_slice(rows, old + more, at)
 
-def _cost_of(prior: PointPrior, points: Points) -> Float[Array, ""]:
-    return jnp.sum(((prior.mean - points.inverse_depth) / prior.sd) ** 2)
+    for layer, of_layer in zip(batch.layers, points, strict=True):
 
+        def add(index: Array, total: tuple, layer: Layer = layer, of_layer: Points = of_layer) -> tuple:
+            chunk, points = layer.chunk(index), jax.tree.map(lambda x: x[index], of_layer)
+            said = chunk.said(noise, poses, points)
+            reduced = reduce(said, points, chunk.prior, damping=damping)
+            before, rows, pull = total
+            b, half = layer.size, 6 * layer.size
+            rows = plus(rows, reduced.information[:half], chunk.begin)
+            rows = plus(rows, reduced.information[half:, half:], chunk.begin + b)
+            at = 6 * chunk.begin
+            there = jax.lax.dynamic_slice_in_dim(pull, at, 2 * half)
+            pull = jax.lax.dynamic_update_slice_in_dim(pull, there + reduced.pull, at, 0)
+            return before + said.cost + chunk.owed(points), rows, pull
 
-def _mapped(function: Callable[[tuple], Any], batch: Batch, points: tuple[Points, ...], *of_poses: Any) -> list:
-    """What a function gives of each chunk, layer by layer, and of what is given of its keyframes."""
-    return [
-        jax.lax.map(function, (layer, p, *(pairs(layer.size, x) for x in of_poses)))
-        for layer, p in zip(batch.layers, points, strict=True)
-    ]
-
-
-def pairs(size: int, each: Any) -> Any:
-    """What each chunk needs of something of every keyframe: that of its two blocks of this size."""
-
-    def pair(x: Array) -> Array:
-        blocks = x.reshape(-1, size, *x.shape[1:])
-        return jnp.concatenate([blocks[:-1], blocks[1:]], axis=1)
-
-    return jax.tree.map(pair, each)
-
-
-def _equations(batch: Batch, poses: SE3, said: Iterable[tuple[Array, Array]]) -> Tridiagonal:
-    """What all layers say, information and pull of each chunk, in the blocks of the last, with the gauge held."""
-    first, *others = (Tridiagonal.of(*layer) for layer in said)
-    total = first
-    for layer in others:
-        total = jax.tree.map(jnp.add, total.coarser(layer.pull.shape[1] // total.pull.shape[1]), layer)
-    free = _free(batch, poses).reshape(-1, batch.layers[-1].size, 6, 6)
-    diagonal, pull = jax.vmap(held)(free, total.diagonal, total.pull)
-    return Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], total.above, free[1:]), pull)
+        total = jax.lax.fori_loop(0, layer.count, add, total)
+    before, rows, pull = total
+    own, above = jnp.triu(rows[:, :, :s]), rows[:-1, :, s:]
+    free = _free(batch, poses).reshape(m, size, 6, 6)
+    diagonal, pull = jax.vmap(held)(free, own + jnp.triu(own, 1).swapaxes(1, 2), pull.reshape(m, s))
+    return before, Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], above, free[1:]), pull)
 
 
 def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:

@@ -20,29 +20,6 @@ class Tridiagonal(NamedTuple):
     above: Float[Array, "c s s"]
     pull: Float[Array, "m s"]
 
-    @classmethod
-    def of(cls, information: Float[Array, "c d d"], pull: Float[Array, "c d"]) -> "Tridiagonal":
-        """Of what each chunk says of its two blocks."""
-        s = pull.shape[1] // 2
-        zero = jnp.zeros((1, s, s), pull.dtype)
-        diagonal = jnp.concatenate([information[:, :s, :s], zero]) + jnp.concatenate([zero, information[:, s:, s:]])
-        return cls(diagonal, information[:, :s, s:], _summed(pull))
-
-    def coarser(self, times: int) -> "Tridiagonal":
-        """The same in blocks that are so many `times` as large."""
-        m, s = self.pull.shape
-        above = jnp.concatenate([self.above, jnp.zeros((1, s, s), self.pull.dtype)])
-        within, beyond = above.reshape(-1, times, s, s), above.reshape(-1, times, s, s)[:-1, -1]
-        at = jnp.arange(times)
-        blocks = jnp.zeros((m // times, times, times, s, s), self.pull.dtype)
-        blocks = blocks.at[:, at, at].set(self.diagonal.reshape(-1, times, s, s))
-        blocks = blocks.at[:, at[:-1], at[1:]].set(within[:, :-1])
-        blocks = blocks.at[:, at[1:], at[:-1]].set(within[:, :-1].swapaxes(2, 3))
-        diagonal = blocks.swapaxes(2, 3).reshape(-1, times * s, times * s)
-        wide = jnp.zeros((m // times - 1, times * s, times * s), self.pull.dtype)
-        wide = wide.at[:, -s:, :s].set(beyond)
-        return Tridiagonal(diagonal, wide, self.pull.reshape(-1, times * s))
-
 
 class Factors(NamedTuple):
     """A block tridiagonal matrix as L L', scaled to a unit diagonal.
@@ -118,10 +95,3 @@ class Factors(NamedTuple):
         _, others = jax.lax.scan(before, last, (self.roots[:-1], self.across), reverse=True)
         blocks = jnp.concatenate([others, last[None]])
         return blocks / (self.scales[:, :, None] * self.scales[:, None])
-
-
-def _summed(pairs: Float[Array, "c d"]) -> Float[Array, "m s"]:
-    """What all chunks say of each block."""
-    zero = jnp.zeros((1, pairs.shape[1] // 2), pairs.dtype)
-    first, second = jnp.split(pairs, 2, axis=1)
-    return jnp.concatenate([first, zero]) + jnp.concatenate([zero, second])

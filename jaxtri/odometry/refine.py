@@ -29,7 +29,7 @@ from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.measuring import doubts, median
 from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.settings import Settings, Status
-from jaxtri.odometry.stretches import Pieces, Segment, blocks, keyframes, segments
+from jaxtri.odometry.stretches import Pieces, Segment, keyframes, room, segments
 from jaxtri.odometry.structure import Points, world_points
 from jaxtri.odometry.window import FAREST, NEAREST, VAGUE
 from jaxtri.trajectory import Trajectory
@@ -135,7 +135,7 @@ class _Adjusted:
     def of(cls, settings: Settings, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
         """Those of a stretch; None where nothing finite came of it."""
         pieces = Pieces.of(segment, keys)
-        dtype, k = segment.u.dtype, blocks(len(keys))[1]
+        dtype, k = segment.u.dtype, room(len(keys))
         centre = -np.einsum("kji,kj->ki", segment.T[keys, :3, :3], segment.T[keys, :3, 3])
         farthest = int(np.argmax(np.linalg.norm(centre - centre[0], axis=1)))
         T = np.concatenate([segment.T[keys], np.broadcast_to(np.eye(4), (k - len(keys), 4, 4))]).astype(dtype)
@@ -287,23 +287,28 @@ _step, _known, _matrices = jax.jit(batch.step), jax.jit(batch.known), jax.jit(SE
 
 @jax.jit
 def _begun(
-    settings: Settings, layers: list[tuple[Array, Array]], poses: SE3
+    settings: Settings, layers: list[tuple[Array, ...]], poses: SE3
 ) -> tuple[tuple[Layer, ...], tuple[Homogeneous, ...], Float[Array, ""]]:
     """The layers, the points by the first and last look at them, and the median depth of the scene."""
     found = []
-    for observed, mask in layers:
-        pairs = batch.pairs(mask.shape[1] // 2, poses)
-        found.append(jax.lax.map(lambda part: looks(part[0], Views(*part[1:])), (pairs, observed, mask)))
+    for observed, mask, begin, _ in layers:
+
+        def one(part: tuple[Array, ...]) -> Looks:
+            observed, mask, begin = part
+            here = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, begin, len(mask)), poses)
+            return looks(here, Views(observed, mask))
+
+        found.append(jax.lax.map(one, (observed, mask, begin)))
     rho, angle = (jnp.concatenate([getattr(f, name).ravel() for f in found]) for name in ("inverse_depth", "angle"))
     wide = (angle > settings.usable_parallax) & (rho > 0)
     depth = median(1 / jnp.where(wide, rho, 1.0), wide)
 
-    def begin(first: Looks, views: tuple[Array, Array]) -> tuple[Layer, Homogeneous]:
+    def start(first: Looks, layer: tuple[Array, ...]) -> tuple[Layer, Homogeneous]:
         rho = jnp.clip(first.inverse_depth, FAREST / depth, NEAREST / depth)
         prior = PointPrior(jnp.full_like(rho, 1 / depth), jnp.full_like(rho, VAGUE / depth))
-        return Layer(*views, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
+        return Layer(*layer, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
 
-    begun, points = zip(*map(begin, found, layers), strict=True)
+    begun, points = zip(*map(start, found, layers), strict=True)
     return begun, points, depth
 
 

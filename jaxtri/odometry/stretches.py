@@ -8,9 +8,10 @@ from jaxtri.odometry.driver import Odometry, normalise
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.slots import Slotted
 
-# Keyframes of a block: of the layer for short tracks, and of the one for long ones at most, which has two blocks at
-# least. A track that is seen in more than two of them is cut.
-SMALL, BLOCK = 8, 32
+# Keyframes of a block of each layer; a track that is seen in more than two of the last is cut. Places for looks in a
+# chunk, so that what is worked out of it stays in a cache; and for chunks of a layer, at least: twice as many as most
+# sequences of a few hundred frames need, so that they share what is compiled.
+SIZES, PLACES, CHUNKS = (4, 8, 16, 32), 2048, 32
 
 
 def segments(odometry: Odometry) -> list[tuple[int, int]]:
@@ -73,13 +74,13 @@ class Pieces(NamedTuple):
     """Tracks cut where a layer of chunks cannot hold them, or where they are not seen, and where each piece went.
 
     Attributes:
-        layers: (observed, mask) of each layer: (c, 2, 2 b, n) and (c, 2 b, n).
+        layers: (observed, mask, begin, count) of each layer, as `jaxtri.estimation.batch.Layer` has them.
         ids: (p,) number of the track of each piece.
         layer, chunk, column: (p,) where it went.
         key, slot, piece: (o,) keyframe, slot and piece of each look.
     """
 
-    layers: list[tuple[np.ndarray, np.ndarray]]
+    layers: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
     ids: np.ndarray
     layer: np.ndarray
     chunk: np.ndarray
@@ -91,8 +92,7 @@ class Pieces(NamedTuple):
     @classmethod
     def of(cls, segment: Segment, keys: np.ndarray) -> "Pieces":
         """Those of the tracks that two keyframes in a row see."""
-        sizes, places = blocks(len(keys))
-        last = sizes[-1]
+        places, last = room(len(keys)), SIZES[-1]
         key, slot = np.nonzero(segment.seen[keys])
         ids = segment.ids[keys][key, slot]
         order = np.lexsort((key, ids))
@@ -108,20 +108,27 @@ class Pieces(NamedTuple):
         begin, end = key[first], key[first + count - 1]
         layer, chunk, column = np.full(len(first), -1), np.zeros(len(first), int), np.zeros(len(first), int)
         layers = []
-        for number, b in enumerate(sizes):
-            c = places // b - 1
-            at = np.minimum(begin // b, c - 1)
-            here = np.flatnonzero((layer < 0) & (end < b * (at + 2)))
-            layer[here], chunk[here] = number, at[here]
-            for k in range(c):
-                column[here[at[here] == k]] = np.arange((at[here] == k).sum())
-            n = _rounded(int(column[here].max(initial=0)) + 1)
+        for number, b in enumerate(SIZES):
+            block = np.minimum(begin // b, places // b - 2)
+            here = np.flatnonzero((layer < 0) & (end < b * (block + 2)))
+            here = here[np.argsort(block[here], kind="stable")]
+            n = PLACES // (2 * b)
+            held = np.bincount(block[here], minlength=places // b)  # tracks that begin in each block
+            chunks = -(-held // n)
+            within = np.arange(len(here)) - np.repeat(np.cumsum(held) - held, held)
+            layer[here], column[here] = number, within % n
+            chunk[here] = np.repeat(np.cumsum(chunks) - chunks, held) + within // n
+            count = chunks.sum()
+            c = max(CHUNKS, 1 << (int(count) - 1).bit_length())
+            starts = np.zeros(c, np.int32)
+            starts[:count] = np.repeat(b * np.arange(len(chunks)), chunks)
             observed, mask = np.zeros((c, 2, 2 * b, n), segment.u.dtype), np.zeros((c, 2 * b, n), bool)
             look = layer[piece] == number
-            where = chunk[piece[look]], key[look] - b * chunk[piece[look]], column[piece[look]]
+            at = chunk[piece[look]]
+            where = at, key[look] - starts[at], column[piece[look]]
             observed[where[0], :, where[1], where[2]] = segment.u[keys[key[look]], slot[look]]
             mask[where] = True
-            layers.append((observed, mask))
+            layers.append((observed, mask, starts, np.asarray(count, np.int32)))
         return cls(layers, ids[first], layer, chunk, column, key, slot, piece)
 
     def each(self, of_layers: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
@@ -137,18 +144,13 @@ class Pieces(NamedTuple):
         found = np.zeros((len(self.key), *shape), of_layers[0].dtype)
         for number, x in enumerate(of_layers):
             here = self.layer[self.piece] == number
-            piece, b = self.piece[here], x.shape[1] // 2
-            found[here] = x[self.chunk[piece], self.key[here] - b * self.chunk[piece], ..., self.column[piece]]
+            piece, begin = self.piece[here], self.layers[number][2]
+            found[here] = x[self.chunk[piece], self.key[here] - begin[self.chunk[piece]], ..., self.column[piece]]
         return found
 
 
-def blocks(keyframes: int) -> tuple[list[int], int]:
-    """Sizes of the blocks of all layers, and how many keyframes the last ones hold."""
-    size = BLOCK if keyframes > 2 * BLOCK else SMALL * -(-keyframes // (2 * SMALL))
-    return [SMALL, size][size == SMALL :], size * max(2, -(-keyframes // size))
-
-
-def _rounded(count: int) -> int:
-    """Up to one of a few sizes, so that little is compiled anew: four to each doubling."""
-    size = max(64, 1 << max(0, count.bit_length() - 3))
-    return -(-count // size) * size
+def room(keyframes: int) -> int:
+    """Places for so many: two of the largest blocks, or more, of which there are four numbers to each doubling."""
+    blocks = max(2, -(-keyframes // SIZES[-1]))
+    step = 1 << max(0, blocks.bit_length() - 3)
+    return SIZES[-1] * step * -(-blocks // step)

@@ -30,24 +30,26 @@ def made(noise=0.0, seed=0):
     R, T = np.asarray(jax.vmap(lambda p: matrix(p.rotation()))(poses)), np.asarray(poses.translation())
     layers, truth, draw = [], [], np.random.default_rng(seed)
     for size, n in ((SMALL, 10), (LARGE, 8)):
-        chunks = K // size - 1
+        # Two chunks begin with the last block but one, and behind them stands what is not counted.
+        begin = size * np.minimum(np.arange(K // size + 1), K // size - 2)
+        chunks = len(begin)
         X = rng.uniform([-1.5, -1, 3], [3.5, 1, 6], (chunks, n, 3))
         mask = np.zeros((chunks, 2 * size, n), bool)
         for c in range(chunks):
             for i in range(n):
-                begin = rng.integers(0, size)
-                mask[c, begin : begin + rng.integers(2, 2 * size + 1), i] = True
-            mask[c, np.arange(size * c, size * (c + 2)) >= SEEN] = False
-        at = size * np.arange(chunks)[:, None] + np.arange(2 * size)
+                first = rng.integers(0, size)
+                mask[c, first : first + rng.integers(2, 2 * size + 1), i] = True
+        at = begin[:, None] + np.arange(2 * size)
+        mask[at >= SEEN] = False
         Z = np.einsum("cvij,cnj->cvin", R[at], X) + T[at][..., None]
         white = draw.normal(size=Z[:, :, :2].shape) * SIGMA * noise
         for v in range(1, 2 * size):  # a part of each error is that of the view before
             again = (mask[:, v] & mask[:, v - 1])[:, None]
             white[:, v] = np.where(again, 0.8 * white[:, v - 1] + 0.6 * white[:, v], white[:, v])
         observed = np.moveaxis(Z[:, :, :2] / Z[:, :, 2:] + white, 2, 1)
-        prior = PointPrior(jnp.full((chunks, n), 0.2), jnp.full((chunks, n), 20.0))
-        layers.append(Layer(jnp.asarray(observed), jnp.asarray(mask), prior))
-        truth.append(X)
+        prior = PointPrior(jnp.full((chunks, n), 0.2), jnp.full((chunks, n), 200.0))
+        layers.append(Layer(*map(jnp.asarray, (observed, mask, begin, chunks - 1)), prior))
+        truth.append(X[:-1])
     return Batch(tuple(layers), jnp.arange(K) < SEEN, jnp.asarray(FARTHEST)), poses, truth
 
 
@@ -55,7 +57,9 @@ def begun(problem, poses):
     """Points by their first and last look."""
 
     def one(layer):
-        first = jax.vmap(lambda p, o, m: looks(p, Views(o, m)))(batch.pairs(layer.size, poses), *layer[:2])
+        first = jax.vmap(lambda c: looks(layer.chunk(c).of(poses), Views(*layer.chunk(c)[:2])))(
+            jnp.arange(len(layer.mask))
+        )
         return jax.vmap(seen_from)(first.R, first.T, first.u, jnp.clip(first.inverse_depth, 0.05, 1.0))
 
     return tuple(map(one, problem.layers))
@@ -76,9 +80,9 @@ def test_the_equations_are_those_of_all_tracks_in_one_piece():
     points = begun(problem, poses)
     dense, pull = np.zeros((6 * K, 6 * K)), np.zeros(6 * K)
     for layer, p in zip(problem.layers, points, strict=True):
-        for c in range(len(layer.mask)):
+        for c in range(int(layer.count)):
             observed, mask = np.zeros((2, K, layer.mask.shape[2])), np.zeros((K, layer.mask.shape[2]), bool)
-            rows = slice(layer.size * c, layer.size * (c + 2))
+            rows = slice(layer.begin[c], layer.begin[c] + 2 * layer.size)
             observed[:, rows], mask[rows] = layer.observed[c], layer.mask[c]
             views = Views(jnp.asarray(observed), jnp.asarray(mask), NOISE.correlation)
             chunk, prior = jax.tree.map(lambda x, c=c: x[c], (p, layer.prior))
@@ -112,14 +116,11 @@ def test_factors_solve_and_invert_a_block_tridiagonal_matrix():
     blocks = A.reshape(4, 3, 4, 3).swapaxes(1, 2)
     at = np.arange(4)
     b = rng.normal(size=(4, 3))
-    fine = Tridiagonal(*map(jnp.asarray, (blocks[at, at], blocks[at[:-1], at[1:]], b)))
-    for equations in (fine, fine.coarser(2)):
-        factors = Factors.of(equations, jnp.asarray(0.0))
-        np.testing.assert_allclose(factors.solve(equations.pull).ravel(), np.linalg.solve(A, b.ravel()), rtol=1e-9)
-        s = equations.pull.shape[1]
-        inverse = np.linalg.inv(A).reshape(12 // s, s, 12 // s, s)
-        own = inverse[np.arange(12 // s), :, np.arange(12 // s)]
-        np.testing.assert_allclose(factors.covariances(), own, rtol=1e-9, atol=1e-12)
+    equations = Tridiagonal(*map(jnp.asarray, (blocks[at, at], blocks[at[:-1], at[1:]], b)))
+    factors = Factors.of(equations, jnp.asarray(0.0))
+    np.testing.assert_allclose(factors.solve(equations.pull).ravel(), np.linalg.solve(A, b.ravel()), rtol=1e-9)
+    own = np.linalg.inv(A).reshape(4, 3, 4, 3)[at, :, at]
+    np.testing.assert_allclose(factors.covariances(), own, rtol=1e-9, atol=1e-12)
 
 
 def test_exact_points_lead_back_to_the_path():
@@ -127,15 +128,15 @@ def test_exact_points_lead_back_to_the_path():
     wrong = off(poses, 0.01)
     found = optimum(problem, PLAIN, wrong, begun(problem, wrong), tolerance=1e-9)
     assert found.converged
-    assert found.cost < 1e-3  # the vague prior's
+    assert found.cost < 1e-4  # the vague prior's
     # Up to the gauge: the scale is that of the pose that is farthest, as it was given.
     scale = np.linalg.norm(wrong.translation()[FARTHEST]) / np.linalg.norm(poses.translation()[FARTHEST])
     assert abs(scale - 1) > 1e-3
     np.testing.assert_allclose(found.poses.translation()[:SEEN], scale * poses.translation()[:SEEN], atol=2e-6)
     np.testing.assert_allclose(found.poses.rotation().wxyz[:SEEN], poses.rotation().wxyz[:SEEN], atol=1e-6)
     for p, X, layer in zip(found.points, truth, problem.layers, strict=True):
-        seen = np.asarray(layer.mask.sum(axis=1)) > 2
-        xyz = np.moveaxis(np.asarray(p.X[:, :3] / p.X[:, 3:]), 1, 2)
+        seen = np.asarray(layer.mask.sum(axis=1))[:-1] > 2
+        xyz = np.moveaxis(np.asarray(p.X[:-1, :3] / p.X[:-1, 3:]), 1, 2)
         np.testing.assert_allclose(xyz[seen], scale * X[seen], rtol=1e-3, atol=1e-3)
 
 
@@ -149,7 +150,7 @@ def test_covariances_are_those_of_the_errors():
 
     @jax.jit
     def run(problem):
-        found = batch.optimum(problem, PLAIN, poses, start, tolerance=1e-3, most=8)
+        found = batch.optimum(problem, PLAIN, poses, start, tolerance=1e-3, most=30)
         known = batch.known(problem, PLAIN, found.poses, found.points)
         errors = jax.vmap(lambda a, b: (b @ a.inverse()).log())(found.poses, poses)
         return errors, known.covariance

@@ -85,8 +85,9 @@ def test_long_sequences_are_cut_into_blocks(run, monkeypatch):
     """The same run in blocks of four keyframes, tracks cut where they reach over more than two: nearly as good."""
     tracks, odometry = run
     whole = refine(odometry)
-    monkeypatch.setattr(stretches, "SMALL", 2)
-    monkeypatch.setattr(stretches, "BLOCK", 4)
+    monkeypatch.setattr(stretches, "SIZES", (2, 4))
+    monkeypatch.setattr(stretches, "PLACES", 128)
+    monkeypatch.setattr(stretches, "CHUNKS", 1)
     cut = refine(odometry)
     assert cut.statistics["parts"][0]["tracks"] > whole.statistics["parts"][0]["tracks"]
     assert errors(tracks, cut.trajectory()).ate_percent < 1.5 * errors(tracks, whole.trajectory()).ate_percent + 0.02
