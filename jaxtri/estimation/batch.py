@@ -10,7 +10,7 @@ Source: Triggs et al. 2000, sections 6 and 7.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,18 +19,15 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri.estimation.bundle import (
-    Linearised,
-    PointPrior,
     Points,
-    Views,
-    cost,
+    considered,
     held,
-    linearise,
     points_given,
     projected,
     reduce,
     without_length,
 )
+from jaxtri.estimation.layers import Batch, Chunk, Layer, Noise
 from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
 from jaxtri.geometry.epipolar import safe_divide, safe_norm
 from jaxtri.geometry.pose import compose, multiply, relative, retract
@@ -39,91 +36,6 @@ DAMPING, BETTER, WORSE = 1e-3, 0.1, 10.0  # of the equations of a step: at first
 TOLERANCE = 0.05  # standard deviations
 MOST = 200  # steps of conjugate gradients; some ten are usual
 LEAST, HOPELESS = 1e-9, 1e6  # damping: no less; from here on no step can lower the cost
-
-
-class Layer(NamedTuple):
-    """Chunks of tracks: room for c of them, n tracks each, a chunk from 2 b keyframes.
-
-    Attributes:
-        observed: (c, 2, 2 b, n) normalised image points.
-        mask: (c, 2 b, n) which of them are seen.
-        begin: (c,) keyframe that a chunk begins with, a multiple of b.
-        count: Chunks that there are; those after them are empty.
-        prior: Of the inverse depths, (c, n) each.
-    """
-
-    observed: Float[Array, "c 2 v n"]
-    mask: Bool[Array, "c v n"]
-    begin: Int[Array, " c"]
-    count: Int[Array, ""]
-    prior: PointPrior
-
-    @property
-    def size(self) -> int:
-        """Keyframes in a block."""
-        return self.mask.shape[1] // 2
-
-    def chunk(self, index: Int[Array, ""] | int) -> "Chunk":
-        """One of them."""
-        return Chunk(*(jax.tree.map(lambda x: x[index], each) for each in (*self[:3], self.prior)))
-
-
-class Chunk(NamedTuple):
-    """A chunk of a `Layer`: its fields without the first axis."""
-
-    observed: Float[Array, "2 v n"]
-    mask: Bool[Array, "v n"]
-    begin: Int[Array, ""]
-    prior: PointPrior
-
-    def of(self, each: Any) -> Any:
-        """What it needs of something of every keyframe."""
-        v = len(self.mask)
-        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, self.begin, v), each)
-
-    def views(self, noise: "Noise") -> Views:
-        """What is seen in it."""
-        return Views(self.observed, self.mask, noise.correlation)
-
-    def said(self, noise: "Noise", poses: SE3, points: Points) -> Linearised:
-        """By the observations."""
-        return linearise(self.of(poses), points, self.views(noise), *noise[:2])
-
-    def cost(self, noise: "Noise", poses: SE3, points: Points) -> Float[Array, ""]:
-        """Of the observations and the prior."""
-        return cost(self.of(poses), points, self.views(noise), *noise[:2]) + self.owed(points)
-
-    def owed(self, points: Points) -> Float[Array, ""]:
-        """To the prior."""
-        return jnp.sum(((self.prior.mean - points.inverse_depth) / self.prior.sd) ** 2)
-
-
-class Batch(NamedTuple):
-    """What is seen from k keyframes.
-
-    Attributes:
-        layers: Blocks of each are several of the one before; k is at least two of the last ones.
-        present: (k,) places that a keyframe stands in; the first one does, and its pose is given.
-        farthest: Keyframe whose distance from the first is given: the unit of length.
-    """
-
-    layers: tuple[Layer, ...]
-    present: Bool[Array, " k"]
-    farthest: Int[Array, ""]
-
-
-class Noise(NamedTuple):
-    """What is assumed of the image points.
-
-    Attributes:
-        sigma: Standard deviation in normalised image units.
-        scale: Of the robust weights: what is new in a point counts a quarter at this squared distance, over sigma.
-        correlation: Of a track's noise in one keyframe with that in the next.
-    """
-
-    sigma: Float[Array, ""]
-    scale: Float[Array, ""]
-    correlation: Float[Array, ""]
 
 
 class Estimate(NamedTuple):
@@ -175,7 +87,7 @@ def step(batch: Batch, noise: Noise, now: Estimate, tolerance: Float[Array, ""] 
         points = points.moved(points_given(said, points, chunk.prior, chunk.of(each), now.damping))
         return points, chunk.cost(noise, poses, points)
 
-    points, after = zip(*_mapped(moved, batch, now.points), strict=True)
+    points, after = zip(*batch.mapped(moved, now.points), strict=True)
     after = _sum(after)
     better = after <= before
     taken, left = (poses, points, after), (now.poses, now.points, before)
@@ -209,10 +121,13 @@ class Known(NamedTuple):
 
     Attributes:
         covariance: (k, 6, 6) of the poses' errors, left perturbations (linear, angular), scene units and radians.
+            The calibration is taken to be exact in it.
+        calibration: (k, 6, p) what errors of the calibration, over their standard deviations, do to the poses.
         points: Of each layer, what is known of its points.
     """
 
     covariance: Float[Array, "k 6 6"]
+    calibration: Float[Array, "k 6 p"]
     points: "tuple[KnownPoints, ...]"
 
 
@@ -241,10 +156,13 @@ def known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) ->
         return KnownPoints(spread, said.residual, said.weights)
 
     _, equations = _equations(batch, noise, poses, points)
-    blocks = Factors.of(equations, jnp.zeros((), noise.sigma.dtype)).covariances()
+    factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
     free, b = _free(batch, poses), batch.layers[-1].size
-    each = blocks.reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)].swapaxes(0, 1).reshape(-1, 6, 6)
-    return Known(free @ each @ free, tuple(_mapped(one, batch, points)))
+    blocks = factors.covariances().reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)]
+    each = blocks.swapaxes(0, 1).reshape(-1, 6, 6)
+    border = jnp.einsum("kab,kbp->kap", free, _border(batch, noise, poses, points))
+    pulled = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(border.reshape(*equations.pull.shape, -1))
+    return Known(free @ each @ free, pulled.reshape(border.shape), tuple(batch.mapped(one, points)))
 
 
 def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 1e-9) -> tuple[SE3, tuple[Points, ...]]:
@@ -271,7 +189,7 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
                 @jax.checkpoint
                 def one(part: tuple[Array, Points]) -> Array:
                     index, points = part
-                    return jnp.where(index < layer.count, layer.chunk(index).cost(noise, moved, points), 0.0)
+                    return jnp.where(index < layer.chunks, layer.chunk(index).cost(noise, moved, points), 0.0)
 
                 return jax.lax.map(one, (jnp.arange(len(layer.mask)), points))
 
@@ -315,7 +233,7 @@ def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) ->
 
     _, equations = _equations(batch, noise, poses, points)
     factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
-    reduced = _mapped(one, batch, points)
+    reduced = batch.mapped(one, points)
 
     def root(white: tuple) -> tuple:
         x = factors.up(white[0].reshape(equations.pull.shape)).reshape(white[0].shape)
@@ -331,23 +249,6 @@ def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) ->
 
 def _sum(each: Iterable[Array]) -> Float[Array, ""]:
     return jnp.sum(jnp.concatenate(list(each)))
-
-
-def _mapped(function: Callable[[Chunk, Points], Any], batch: Batch, points: tuple[Points, ...]) -> list:
-    """What a function gives of each chunk and its points, layer by layer; zeros for chunks that there are not."""
-
-    def of_layer(layer: Layer, points: Points) -> Any:
-        def one(index: Array | int) -> Any:
-            return function(layer.chunk(index), jax.tree.map(lambda x: x[index], points))
-
-        def put(index: Array, found: Any) -> Any:
-            return jax.tree.map(lambda x, y: x.at[index].set(y), found, one(index))
-
-        room = len(layer.mask)
-        empty = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(one, 0))
-        return jax.lax.fori_loop(0, layer.count, put, empty)
-
-    return [of_layer(layer, p) for layer, p in zip(batch.layers, points, strict=True)]
 
 
 def _equations(
@@ -379,12 +280,29 @@ def _equations(
             pull = jax.lax.dynamic_update_slice_in_dim(pull, there + reduced.pull, at, 0)
             return before + said.cost + chunk.owed(points), rows, pull
 
-        total = jax.lax.fori_loop(0, layer.count, add, total)
+        total = jax.lax.fori_loop(0, layer.chunks, add, total)
     before, rows, pull = total
     own, above = jnp.triu(rows[:, :, :s]), rows[:-1, :, s:]
     free = _free(batch, poses).reshape(m, size, 6, 6)
     diagonal, pull = jax.vmap(held)(free, own + jnp.triu(own, 1).swapaxes(1, 2), pull.reshape(m, s))
     return before, Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], above, free[1:]), pull)
+
+
+def _border(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Float[Array, "k 6 p"]:
+    """How errors of the calibration pull the poses."""
+    p = batch.layers[0].slope.shape[2]
+    total = jnp.zeros((len(batch.present), 6, p), noise.sigma.dtype)
+    for layer, of_layer in zip(batch.layers, points, strict=True):
+
+        def add(index: Array, total: Array, layer: Layer = layer, of_layer: Points = of_layer) -> Array:
+            chunk, points = layer.chunk(index), jax.tree.map(lambda x: x[index], of_layer)
+            said = chunk.said(noise, poses, points)
+            common = jnp.transpose(chunk.slope, (2, 0, 1, 3)) / noise.sigma
+            more = considered(said, reduce(said, points, chunk.prior), common).reshape(-1, 6, p)
+            return jax.lax.dynamic_update_slice_in_dim(total, chunk.of(total) + more, chunk.begin, 0)
+
+        total = jax.lax.fori_loop(0, layer.chunks, add, total)
+    return total
 
 
 def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:

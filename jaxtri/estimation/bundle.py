@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
+from jaxtri.estimation.precision import Precision, before, block_diagonal
 from jaxtri.filters.linalg import linearised
 from jaxtri.geometry.epipolar import inverse_depth, parallax, safe_divide
 from jaxtri.geometry.pose import matrix, retract
@@ -156,8 +157,8 @@ def _seen(Z: Float[Array, "k 3 n"], views: Views, sigma: Float[Array, ""], scale
     if views.correlation is None:
         kept, distance = None, jnp.sum(residual**2, axis=1)
     else:
-        kept = jnp.where(seen & _before(seen), views.correlation, 0.0)
-        distance = jnp.sum((residual - kept[:, None] * _before(residual)) ** 2, axis=1) / (1 - kept**2)
+        kept = jnp.where(seen & before(seen), views.correlation, 0.0)
+        distance = jnp.sum((residual - kept[:, None] * before(residual)) ** 2, axis=1) / (1 - kept**2)
     root = jnp.where(seen, 1 / (1 + distance / scale), 0.0)
     # What is seen, and would lie behind the camera, costs as much as any outlier.
     costs = jnp.where(views.mask, jnp.where(seen, distance * root, scale), 0.0)
@@ -190,53 +191,6 @@ def linearise(poses: SE3, points: Points, views: Views, sigma: Float[Array, ""],
     pose = (dZ_pose[:, :, :2] - image * dZ_pose[:, :, 2:]) * over
     point = (dZ_point[:, :, :2] - image * dZ_point[:, :, 2:]) * over
     return jax.lax.optimization_barrier(Linearised(found.residual, pose, point, found.kept, found.root**2, found.cost))
-
-
-def _before(x: Array) -> Array:
-    """Of each view what is in the view before it; zero in the first."""
-    return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
-
-
-class Precision(NamedTuple):
-    """Inverse covariances of the tracks' residuals, tridiagonal: a view's own, and what it has with that before."""
-
-    own: Float[Array, "k n"]
-    shared: Float[Array, "k n"] | None
-
-    @classmethod
-    def of(cls, said: Linearised, mask: Bool[Array, "k n"] | None = None) -> "Precision":
-        """Of what is new in the observations in `mask`."""
-        weights = said.weights if mask is None else jnp.where(mask, said.weights, 0.0)
-        if said.kept is None:
-            return cls(weights, None)
-        new = weights / (1 - said.kept**2)
-        own = new + jnp.concatenate([(new * said.kept**2)[1:], jnp.zeros_like(new[:1])])
-        return cls(own, -new * said.kept)
-
-    def __matmul__(self, x: Float[Array, "k *c n"]) -> Float[Array, "k *c n"]:
-        def wide(y: Array) -> Array:
-            return y.reshape(y.shape[0], *(1,) * (x.ndim - 2), y.shape[1])
-
-        if self.shared is None:
-            return wide(self.own) * x
-        shared = wide(self.shared)
-        after = jnp.concatenate([shared[1:] * x[1:], jnp.zeros_like(x[:1])])
-        return wide(self.own) * x + shared * _before(x) + after
-
-    def of_poses(self, pose: Float[Array, "k 6 2 n"]) -> Float[Array, "s s"]:
-        """What the residuals say of the poses, the points given."""
-        k, n = self.own.shape
-        each = pose.reshape(k, 6, 2 * n)
-
-        def products(weights: Array, others: Array) -> Array:
-            heavy = (pose[-len(weights) :] * weights[:, None, None]).reshape(len(weights), 6, 2 * n)
-            return jnp.einsum("kem,kfm->kef", heavy, others)
-
-        U = block_diagonal(products(self.own, each))
-        if self.shared is None:
-            return U
-        below = jnp.pad(block_diagonal(products(self.shared[1:], each[:-1])), ((6, 0), (0, 6)))
-        return U + below + below.T
 
 
 class Reduced(NamedTuple):
@@ -283,14 +237,14 @@ def reduce(
     """
     pose, point = said.pose, said.point
     k, _, _, n = pose.shape
-    precision = Precision.of(said, mask)
+    precision = Precision.of(said.weights if mask is None else jnp.where(mask, said.weights, 0.0), said.kept)
     heavy, left = jax.lax.optimization_barrier((precision @ point, precision @ said.residual))
     root, offset = _points(point, heavy, left, points, prior, damping)
     # The root first, on the points' side: a third of the sums.
     rooted = jax.lax.optimization_barrier(jnp.einsum("tsn,ksan->ktan", root, heavy))
     cross = jnp.sum(pose[:, :, None] * rooted[:, None], axis=3).reshape(6 * k, 3, n)
-    flat = cross.reshape(6 * k, 3 * n)
     direct = jnp.einsum("kem,km->ke", pose.reshape(k, 6, 2 * n), left.reshape(k, 2 * n)).reshape(6 * k)
+    flat = cross.reshape(6 * k, 3 * n)
     information = precision.of_poses(pose) - flat @ flat.T
     return Reduced(information, direct - flat @ offset.reshape(-1), root, cross, offset)
 
@@ -322,10 +276,23 @@ def points_given(
     damping: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, "3 n"]:
     """The errors of the points that are best once those of the poses are given, as `Reduced.points` has them."""
-    precision = Precision.of(said)
+    precision = Precision.of(said.weights, said.kept)
     moved = said.residual - jnp.einsum("kean,ke->kan", said.pose, step)
     root, offset = _points(said.point, precision @ said.point, precision @ moved, points, prior, damping)
     return jnp.einsum("tsn,tn->sn", root, offset)
+
+
+def considered(said: Linearised, reduced: Reduced, common: Float[Array, "k 2 p n"]) -> Float[Array, "s p"]:
+    """What p numbers that are not estimated, but move all images, have to do with the poses, whatever the points.
+
+    Their error pulls the poses by this times it. `common` is the derivative of the observations with respect to them,
+    over sigma. Source: Schmidt 1966; Bierman 1977, chapter VIII.
+    """
+    k, _, p, _ = common.shape
+    heavy = jnp.moveaxis(Precision.of(said.weights, said.kept) @ common, 2, 1)
+    direct = jnp.einsum("kean,kpan->kep", said.pose, heavy).reshape(6 * k, p)
+    own = jnp.einsum("ksan,kpan->psn", said.point, heavy)
+    return direct - jnp.einsum("etn,ptn->ep", reduced.cross, jnp.einsum("tsn,psn->ptn", reduced.root, own))
 
 
 def without_length(between: Float[Array, "3"]) -> Float[Array, "6 6"]:
@@ -353,12 +320,6 @@ def held(
     rest = (jnp.eye(6, dtype=pull.dtype) - free) * jnp.where(size > 0, size, 1.0)[:, None, None]
     pull = jnp.einsum("kab,kb->ka", free, pull.reshape(k, 6)).reshape(6 * k)
     return projected(free, information, free) + block_diagonal(rest), pull
-
-
-def block_diagonal(each: Float[Array, "k e e"]) -> Float[Array, "s s"]:
-    """The matrix that has these blocks on its diagonal."""
-    k, e, _ = each.shape
-    return (each[:, :, None] * jnp.eye(k, dtype=each.dtype)[:, None, :, None]).reshape(k * e, k * e)
 
 
 def _inverse_root(V: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:

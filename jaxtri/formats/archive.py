@@ -149,7 +149,13 @@ class _Reader:
             case {"enum": name, "value": value}:
                 return self._class(name)(value)
             case {"class": name, "fields": fields}:
-                return _made(self._class(name), {key: self.read(value) for key, value in fields.items()})
+                kind = self._class(name)
+                if missing := _missing(kind, fields):
+                    raise InputError(
+                        f"{self.path} was saved by another version of jaxtri: its {kind.__name__} has no "
+                        f"{', '.join(missing)}; make it anew"
+                    )
+                return _made(kind, {key: self.read(value) for key, value in fields.items()})
         raise InputError(f"{self.path}: {str(node)[:80]} is no node of an archive")
 
     def _class(self, name: str) -> type:
@@ -167,6 +173,19 @@ class _Reader:
         if not isinstance(found, type):
             raise InputError(f"{self.path} holds a {name}, which this version of the package does not know")
         return found
+
+
+def _missing(kind: type, fields: dict[str, Any]) -> list[str]:
+    """What an instance needs and the file does not have."""
+    if issubclass(kind, tuple):
+        needed = [name for name in getattr(kind, "_fields", ()) if name not in getattr(kind, "_field_defaults", ())]
+    else:
+        needed = [
+            f.name
+            for f in dataclasses.fields(kind)
+            if f.default is dataclasses.MISSING and f.metadata.get("saved", True)
+        ]
+    return [name for name in needed if name not in fields]
 
 
 def _made(kind: type, fields: dict[str, Any]) -> Any:

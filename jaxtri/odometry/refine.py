@@ -18,9 +18,10 @@ from tqdm import tqdm
 from jaxtri.compilation import capacity
 from jaxtri.errors import InputError
 from jaxtri.estimation import batch
-from jaxtri.estimation.batch import Batch, Estimate, Layer, Noise
+from jaxtri.estimation.batch import Estimate
 from jaxtri.estimation.bundle import Looks, PointPrior, Views, looks, seen_from
 from jaxtri.estimation.bundle import Points as Homogeneous
+from jaxtri.estimation.layers import Batch, Layer, Noise
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import adjoint, exp_pose, local, multiply, relative
 from jaxtri.models.base_pairs import BasePairs, BasePoint
@@ -67,8 +68,9 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
 
     Where the camera was lost, each part is refined by itself. Its first pose stays, and so does its scale: the distance
     from there to the keyframe that is farthest from it. Covariances are with respect to these two, by the noise that is
-    found where that is more than the one assumed. Raises `InputError` where no tracks were kept, `InitialisationError`
-    where there is no pose.
+    found where that is more than the one assumed. What the camera's calibration may be off by (`Settings.calibration`)
+    is in them too; it is not estimated, since it looks too much like what features that drift do. Raises `InputError`
+    where no tracks were kept, `InitialisationError` where there is no pose.
     """
     if not odometry.record:
         raise InputError("nothing was recorded: ask for it by record=True")
@@ -82,7 +84,7 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
         segment = Segment.of(odometry, first, end)
         keys = keyframes(odometry.settings, segment)
         last = poses[end - 1].T_camera_world
-        found = _Adjusted.of(odometry.settings, segment, keys, progress) if len(keys) >= FEWEST else None
+        found = _Adjusted.of(odometry, segment, keys, progress) if len(keys) >= FEWEST else None
         if found is None:
             parts.append({"frames": [first, end - 1], "refined": False})
         else:
@@ -132,9 +134,11 @@ class _Adjusted:
     statistics: dict[str, object]
 
     @classmethod
-    def of(cls, settings: Settings, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
+    def of(cls, odometry: Odometry, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
         """Those of a stretch; None where nothing finite came of it."""
-        pieces = Pieces.of(segment, keys)
+        settings = odometry.settings
+        assert settings is not None
+        pieces = Pieces.of(segment, keys, segment.slope(odometry.camera, keys) * float(settings.calibration))
         dtype, k = segment.u.dtype, room(len(keys))
         centre = -np.einsum("kji,kj->ki", segment.T[keys, :3, :3], segment.T[keys, :3, 3])
         farthest = int(np.argmax(np.linalg.norm(centre - centre[0], axis=1)))
@@ -152,7 +156,7 @@ class _Adjusted:
             bar.update()
         bar.close()
         known = _known(problem, noise, now.poses, now.points)
-        covariance = np.asarray(known.covariance)[: len(keys)]
+        covariance, response = (np.asarray(x)[: len(keys)] for x in known[:2])
         if not (np.isfinite(covariance).all() and np.isfinite(np.asarray(now.poses.wxyz_xyz)).all()):
             return None
         X = pieces.each([np.asarray(p.X) for p in now.points], (4,))
@@ -173,7 +177,7 @@ class _Adjusted:
         }
         inflation = max(inflation, 1.0)
         spread = pieces.each(spread, (4, 3)) * np.sqrt(inflation)
-        poses = now.poses, covariance * inflation
+        poses = now.poses, covariance * inflation + response @ response.swapaxes(1, 2)
         looks = pieces.looks(residual, (2,)), distance / inflation
         return cls(segment, keys, pieces, noise, float(depth), *poses, X, spread, agreed, *looks, said)
 
@@ -291,7 +295,7 @@ def _begun(
 ) -> tuple[tuple[Layer, ...], tuple[Homogeneous, ...], Float[Array, ""]]:
     """The layers, the points by the first and last look at them, and the median depth of the scene."""
     found = []
-    for observed, mask, begin, _ in layers:
+    for observed, mask, _, begin, _ in layers:
 
         def one(part: tuple[Array, ...]) -> Looks:
             observed, mask, begin = part
@@ -306,7 +310,8 @@ def _begun(
     def start(first: Looks, layer: tuple[Array, ...]) -> tuple[Layer, Homogeneous]:
         rho = jnp.clip(first.inverse_depth, FAREST / depth, NEAREST / depth)
         prior = PointPrior(jnp.full_like(rho, 1 / depth), jnp.full_like(rho, VAGUE / depth))
-        return Layer(*layer, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
+        observed, mask, slope, begin, chunks = layer
+        return Layer(observed, mask, slope, begin, chunks, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
 
     begun, points = zip(*map(start, found, layers), strict=True)
     return begun, points, depth

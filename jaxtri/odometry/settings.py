@@ -77,6 +77,9 @@ class Settings(eqx.Module):
             (`jaxtri.refine`). A feature that is followed from frame to frame drifts: 0.9 by default, which fits the
             feature tracker of `jaxtri.vision` on real video. 0 is noise drawn anew in every frame: features that are
             found in each, and matched.
+        calibration: Standard deviation of the focal length as a share of it, and of the principal point as a share of
+            the focal length: 0.003 by default, 1.5 pixels of 500, which is what a good calibration reaches. It is in
+            the covariances of `jaxtri.refine`. Higher for a camera that was guessed; 0 for one that is exact.
         acceleration: Standard deviation of the camera's acceleration, in median scene depths per frame^2. Higher trusts
             the prediction less: it survives jerks and smooths less.
         angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2. Higher and lower do
@@ -111,6 +114,7 @@ class Settings(eqx.Module):
 
     sigma: Float[Array, ""] = eqx.field(converter=number)
     correlation: Float[Array, ""] = eqx.field(converter=number)
+    calibration: Float[Array, ""] = eqx.field(converter=number)
     acceleration: Float[Array, ""] = eqx.field(converter=number)
     angular_acceleration: Float[Array, ""] = eqx.field(converter=number)
     keyframe_flow: Float[Array, ""] = eqx.field(converter=number)
@@ -146,6 +150,7 @@ class Settings(eqx.Module):
         return cls(
             sigma=noise_px / focal,
             correlation=scalar(0.9),
+            calibration=scalar(0.003),
             acceleration=scalar(0.2),
             angular_acceleration=scalar(0.2),
             keyframe_flow=0.026 * width / focal,

@@ -6,8 +6,10 @@ from intervals import nees_interval
 from jaxlie import SE3
 
 from jaxtri.estimation import batch
-from jaxtri.estimation.batch import Batch, Estimate, Layer, Noise
-from jaxtri.estimation.bundle import PointPrior, Views, block_diagonal, linearise, looks, reduce, seen_from
+from jaxtri.estimation.batch import Estimate
+from jaxtri.estimation.bundle import PointPrior, Views, linearise, looks, reduce, seen_from
+from jaxtri.estimation.layers import Batch, Layer, Noise
+from jaxtri.estimation.precision import block_diagonal
 from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
 from jaxtri.geometry.pose import matrix, retract
 
@@ -48,7 +50,8 @@ def made(noise=0.0, seed=0):
             white[:, v] = np.where(again, 0.8 * white[:, v - 1] + 0.6 * white[:, v], white[:, v])
         observed = np.moveaxis(Z[:, :, :2] / Z[:, :, 2:] + white, 2, 1)
         prior = PointPrior(jnp.full((chunks, n), 0.2), jnp.full((chunks, n), 200.0))
-        layers.append(Layer(*map(jnp.asarray, (observed, mask, begin, chunks - 1)), prior))
+        slope = np.random.default_rng(7).normal(size=(chunks, 2, 2, 2 * size, n)) * SIGMA
+        layers.append(Layer(*map(jnp.asarray, (observed, mask, slope, begin, chunks - 1)), prior))
         truth.append(X[:-1])
     return Batch(tuple(layers), jnp.arange(K) < SEEN, jnp.asarray(FARTHEST)), poses, truth
 
@@ -80,7 +83,7 @@ def test_the_equations_are_those_of_all_tracks_in_one_piece():
     points = begun(problem, poses)
     dense, pull = np.zeros((6 * K, 6 * K)), np.zeros(6 * K)
     for layer, p in zip(problem.layers, points, strict=True):
-        for c in range(int(layer.count)):
+        for c in range(int(layer.chunks)):
             observed, mask = np.zeros((2, K, layer.mask.shape[2])), np.zeros((K, layer.mask.shape[2]), bool)
             rows = slice(layer.begin[c], layer.begin[c] + 2 * layer.size)
             observed[:, rows], mask[rows] = layer.observed[c], layer.mask[c]
@@ -138,6 +141,24 @@ def test_exact_points_lead_back_to_the_path():
         seen = np.asarray(layer.mask.sum(axis=1))[:-1] > 2
         xyz = np.moveaxis(np.asarray(p.X[:-1, :3] / p.X[:-1, 3:]), 1, 2)
         np.testing.assert_allclose(xyz[seen], scale * X[seen], rtol=1e-3, atol=1e-3)
+
+
+def test_what_an_error_of_the_calibration_does_to_the_poses():
+    """Against what it does: the optimum where all image points are moved by it."""
+    problem, poses, _ = made()
+    start = begun(problem, poses)
+    response = jax.jit(batch.known)(problem, PLAIN, poses, start).calibration
+    error = jnp.asarray([1e-3, -2e-3])
+
+    def moved(sign):
+        shift = [jnp.einsum("capvn,p->cavn", layer.slope, sign * error) for layer in problem.layers]
+        layers = [layer._replace(observed=layer.observed + s) for layer, s in zip(problem.layers, shift, strict=True)]
+        return optimum(problem._replace(layers=tuple(layers)), PLAIN, poses, start, tolerance=1e-9, most=60).poses
+
+    found = jax.vmap(lambda a, b: (a @ b.inverse()).log())(moved(1.0), moved(-1.0)) / 2
+    expected = jnp.einsum("kep,p->ke", response, error)
+    assert abs(expected).max() > 1e-6
+    np.testing.assert_allclose(found[:SEEN], expected[:SEEN], atol=1e-3 * abs(expected).max())
 
 
 def test_covariances_are_those_of_the_errors():
