@@ -76,8 +76,18 @@ def step(batch: Batch, noise: Noise, now: Estimate, tolerance: Float[Array, ""] 
     The `tolerance` is that of the length of the poses' step, over what they are known to, in the mean of squares of
     their components; and that is judged by the noise that is found, not by the one assumed.
     """
+    return _stepped(batch, noise, now, *_equations(batch, noise, now.poses, now.points, now.damping), tolerance)
 
-    before, equations = _equations(batch, noise, now.poses, now.points, now.damping)
+
+@jax.jit
+def _stepped(
+    batch: Batch,
+    noise: Noise,
+    now: Estimate,
+    before: Float[Array, ""],
+    equations: Tridiagonal,
+    tolerance: Float[Array, ""] | float,
+) -> Estimate:
     x = Factors.of(equations, now.damping).solve(equations.pull)
     each = x.reshape(-1, 6)
     poses = _moved(batch, now.poses, each)
@@ -148,21 +158,31 @@ class KnownPoints(NamedTuple):
 
 def known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Known:
     """The covariances at an estimate."""
+    _, equations = _equations(batch, noise, poses, points, jnp.zeros((), noise.sigma.dtype))
+    return _known(batch, noise, poses, points, equations)
 
-    def one(chunk: Chunk, points: Points) -> KnownPoints:
+
+@jax.jit
+def _known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], equations: Tridiagonal) -> Known:
+    def one(chunk: Chunk, points: Points) -> tuple[KnownPoints, Array]:
         said = chunk.said(noise, poses, points)
-        root = reduce(said, points, chunk.prior).root
-        spread = jnp.einsum("qsn,tsn->qtn", points.basis, root) / noise.sigma
-        return KnownPoints(spread, said.residual, said.weights)
+        reduced = reduce(said, points, chunk.prior)
+        spread = jnp.einsum("qsn,tsn->qtn", points.basis, reduced.root) / noise.sigma
+        common = jnp.transpose(chunk.slope, (2, 0, 1, 3)) / noise.sigma
+        pull = considered(said, reduced, common).reshape(len(chunk.mask), 6, -1)
+        return KnownPoints(spread, said.residual, said.weights), pull
 
-    _, equations = _equations(batch, noise, poses, points)
+    of_points, pulls = zip(*batch.mapped(one, points), strict=True)
+    border = jnp.zeros((len(batch.present), *pulls[0].shape[2:]), noise.sigma.dtype)
+    for layer, pull in zip(batch.layers, pulls, strict=True):
+        border = border.at[layer.begin[:, None] + jnp.arange(pull.shape[1])].add(pull)
     factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
     free, b = _free(batch, poses), batch.layers[-1].size
     blocks = factors.covariances().reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)]
     each = blocks.swapaxes(0, 1).reshape(-1, 6, 6)
-    border = jnp.einsum("kab,kbp->kap", free, _border(batch, noise, poses, points))
+    border = jnp.einsum("kab,kbp->kap", free, border)
     pulled = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(border.reshape(*equations.pull.shape, -1))
-    return Known(free @ each @ free, pulled.reshape(border.shape), tuple(batch.mapped(one, points)))
+    return Known(free @ each @ free, pulled.reshape(border.shape), of_points)
 
 
 def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 1e-9) -> tuple[SE3, tuple[Points, ...]]:
@@ -231,8 +251,9 @@ def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) ->
         reduced = reduce(chunk.said(noise, poses, points), points, chunk.prior)
         return reduced.root, reduced.cross
 
-    _, equations = _equations(batch, noise, poses, points)
-    factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
+    none = jnp.zeros((), noise.sigma.dtype)
+    _, equations = _equations(batch, noise, poses, points, none)
+    factors = Factors.of(equations, none)
     reduced = batch.mapped(one, points)
 
     def root(white: tuple) -> tuple:
@@ -251,8 +272,9 @@ def _sum(each: Iterable[Array]) -> Float[Array, ""]:
     return jnp.sum(jnp.concatenate(list(each)))
 
 
+@jax.jit  # for eager callers: compiled once, for steps and for covariances
 def _equations(
-    batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], damping: Float[Array, ""] | float = 0.0
+    batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], damping: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Tridiagonal]:
     """The cost, and what all chunks say of the poses, in the blocks of the last layer, with the gauge held."""
     size, dtype = batch.layers[-1].size, noise.sigma.dtype
@@ -286,23 +308,6 @@ def _equations(
     free = _free(batch, poses).reshape(m, size, 6, 6)
     diagonal, pull = jax.vmap(held)(free, own + jnp.triu(own, 1).swapaxes(1, 2), pull.reshape(m, s))
     return before, Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], above, free[1:]), pull)
-
-
-def _border(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Float[Array, "k 6 p"]:
-    """How errors of the calibration pull the poses."""
-    p = batch.layers[0].slope.shape[2]
-    total = jnp.zeros((len(batch.present), 6, p), noise.sigma.dtype)
-    for layer, of_layer in zip(batch.layers, points, strict=True):
-
-        def add(index: Array, total: Array, layer: Layer = layer, of_layer: Points = of_layer) -> Array:
-            chunk, points = layer.chunk(index), jax.tree.map(lambda x: x[index], of_layer)
-            said = chunk.said(noise, poses, points)
-            common = jnp.transpose(chunk.slope, (2, 0, 1, 3)) / noise.sigma
-            more = considered(said, reduce(said, points, chunk.prior), common).reshape(-1, 6, p)
-            return jax.lax.dynamic_update_slice_in_dim(total, chunk.of(total) + more, chunk.begin, 0)
-
-        total = jax.lax.fori_loop(0, layer.chunks, add, total)
-    return total
 
 
 def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:

@@ -150,12 +150,12 @@ class _Adjusted:
         now, costs = Estimate.of(poses, points), []
         bar = tqdm(total=MOST, unit="step", desc="refine", disable=None if progress else True, leave=False)
         while not bool(now.done) and len(costs) < MOST:
-            now = _step(problem, noise, now)
+            now = batch.step(problem, noise, now)
             costs.append(float(now.cost))
             bar.set_postfix_str(f"cost {costs[-1]:.6g}", refresh=False)
             bar.update()
         bar.close()
-        known = _known(problem, noise, now.poses, now.points)
+        known = batch.known(problem, noise, now.poses, now.points)
         covariance, response = (np.asarray(x)[: len(keys)] for x in known[:2])
         if not (np.isfinite(covariance).all() and np.isfinite(np.asarray(now.poses.wxyz_xyz)).all()):
             return None
@@ -286,7 +286,7 @@ def _over_found(distance: np.ndarray, agree: np.ndarray) -> np.ndarray:
     return 2 * distance / max(float(distance[agree].mean()) if agree.any() else 2.0, 2.0)
 
 
-_step, _known, _matrices = jax.jit(batch.step), jax.jit(batch.known), jax.jit(SE3.as_matrix)
+_matrices = jax.jit(SE3.as_matrix)
 
 
 @jax.jit

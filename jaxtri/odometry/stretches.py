@@ -16,7 +16,7 @@ from jaxtri.odometry.slots import Slotted
 # Keyframes of a block of each layer; a track that is seen in more than two of the last is cut. Places for looks in a
 # chunk, so that what is worked out of it stays in a cache; and for chunks of a layer, at least: twice as many as most
 # sequences of a few hundred frames need, so that they share what is compiled.
-SIZES, PLACES, CHUNKS = (4, 8, 16, 32), 2048, 32
+SIZES, PLACES, CHUNKS = (8, 32), 4096, 32
 
 
 def segments(odometry: Odometry) -> list[tuple[int, int]]:
