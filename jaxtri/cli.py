@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from jaxtri.geometry.camera import Camera
 
 
+GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
+
+
 @dataclass
 class Track:
     """Recover a camera's motion from a video and write the trajectory, a plot, an overlay and the points."""
@@ -196,9 +199,12 @@ def _how(camera: "Camera", options: Track) -> dict[str, Any]:
     base = Base(options.base)
     changes = {} if options.min_parallax is None else {"parallax_deg": options.min_parallax}
     poselib = options.starts == "poselib"
+    settings = Settings.of(camera, noise_px=options.noise_px)
+    if options.fov is not None:
+        settings = Settings.of(camera, noise_px=options.noise_px, calibration=GUESS)
     return {
         "base": base,
-        "settings": Settings.of(camera, noise_px=options.noise_px),
+        "settings": settings,
         "start": StartSettings.of(base, overlap=options.overlap, poselib=poselib, **changes),
         "klt": KLTSettings(capacity=options.features),
     }

@@ -186,6 +186,8 @@ def test_a_base_may_be_a_word_and_no_other_word(door):
 def test_noises_and_focal_lengths_are_positive(value):
     with pytest.raises(InputError, match="noise_px is"):
         Settings.of(CAMERA, noise_px=value)
+    with pytest.raises(InputError, match="calibration is"):
+        Settings.of(CAMERA, calibration=value - 0.1 if value == 0 else value)
     with pytest.raises(InputError, match=r"settings.sigma is"):
         Odometry(CAMERA, dataclasses.replace(Settings.of(CAMERA), sigma=value))
     with pytest.raises(CameraError, match="fx is"):

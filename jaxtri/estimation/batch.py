@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri.estimation.bundle import (
     Points,
-    considered,
+    calibration_pull,
     held,
     points_given,
     projected,
@@ -132,12 +132,12 @@ class Known(NamedTuple):
     Attributes:
         covariance: (k, 6, 6) of the poses' errors, left perturbations (linear, angular), scene units and radians.
             The calibration is taken to be exact in it.
-        calibration: (k, 6, p) what errors of the calibration, over their standard deviations, do to the poses.
+        calibration: (k, 6, 3) what errors of the calibration do to the poses; see `bundle.calibration_pull`.
         points: Of each layer, what is known of its points.
     """
 
     covariance: Float[Array, "k 6 6"]
-    calibration: Float[Array, "k 6 p"]
+    calibration: Float[Array, "k 6 3"]
     points: "tuple[KnownPoints, ...]"
 
 
@@ -168,8 +168,7 @@ def _known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], e
         said = chunk.said(noise, poses, points)
         reduced = reduce(said, points, chunk.prior)
         spread = jnp.einsum("qsn,tsn->qtn", points.basis, reduced.root) / noise.sigma
-        common = jnp.transpose(chunk.slope, (2, 0, 1, 3)) / noise.sigma
-        pull = considered(said, reduced, common).reshape(len(chunk.mask), 6, -1)
+        pull = calibration_pull(said, reduced, chunk.observed, noise.sigma).reshape(len(chunk.mask), 6, -1)
         return KnownPoints(spread, said.residual, said.weights), pull
 
     of_points, pulls = zip(*batch.mapped(one, points), strict=True)

@@ -282,14 +282,27 @@ def points_given(
     return jnp.einsum("tsn,tn->sn", root, offset)
 
 
-def considered(said: Linearised, reduced: Reduced, common: Float[Array, "k 2 p n"]) -> Float[Array, "s p"]:
-    """What p numbers that are not estimated, but move all images, have to do with the poses, whatever the points.
+def calibration_pull(
+    said: Linearised,
+    reduced: Reduced,
+    observed: Float[Array, "2 k n"],
+    sigma: Float[Array, ""],
+    mask: Bool[Array, "k n"] | None = None,
+) -> Float[Array, "s 3"]:
+    """What errors of the camera's calibration pull the poses by, whatever the points: it is considered, not estimated.
 
-    Their error pulls the poses by this times it. `common` is the derivative of the observations with respect to them,
-    over sigma. Source: Schmidt 1966; Bierman 1977, chapter VIII.
+    Errors of the focal length, as a share of it, and of the principal point, as shares of the focal length: these move
+    the image points. (To first order in the lens's distortion, too.) Of the observations in `mask`.
+    Source: Schmidt 1966; Bierman 1977, chapter VIII.
     """
-    k, _, p, _ = common.shape
-    heavy = jnp.moveaxis(Precision.of(said.weights, said.kept) @ common, 2, 1)
+    k, _, n = said.residual.shape
+    p = 3
+    # Derivative of the normalised image points, and so of the residuals: of (pixel - centre) / focal length.
+    centre = jnp.broadcast_to(jnp.eye(2, dtype=sigma.dtype)[None, :, :, None], (k, 2, 2, n))
+    common = -jnp.concatenate([jnp.moveaxis(observed, 0, 1)[:, None], centre], axis=1) / sigma
+    weights = said.weights if mask is None else jnp.where(mask, said.weights, 0.0)
+    common = jnp.where((weights > 0)[:, None, None], common, 0.0)
+    heavy = Precision.of(weights, said.kept) @ common
     direct = jnp.einsum("kean,kpan->kep", said.pose, heavy).reshape(6 * k, p)
     own = jnp.einsum("ksan,kpan->psn", said.point, heavy)
     return direct - jnp.einsum("etn,ptn->ep", reduced.cross, jnp.einsum("tsn,psn->ptn", reduced.root, own))
@@ -311,14 +324,14 @@ def projected(left: Float[Array, "k 6 6"], A: Float[Array, "s s"], right: Float[
 
 
 def held(
-    free: Float[Array, "k 6 6"], information: Float[Array, "s s"], pull: Float[Array, " s"]
-) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+    free: Float[Array, "k 6 6"], information: Float[Array, "s s"], pull: Float[Array, "s *q"]
+) -> tuple[Float[Array, "s s"], Float[Array, "s *q"]]:
     """Normal equations whose solution has no other errors than those that are `free`: projections, pose by pose."""
     k = len(free)
     size = jnp.trace(information.reshape(k, 6, k, 6).diagonal(axis1=0, axis2=2)) / 6
     # What is not free gets information of its own: as much as the rest of its pose, so that all stay of one scale.
     rest = (jnp.eye(6, dtype=pull.dtype) - free) * jnp.where(size > 0, size, 1.0)[:, None, None]
-    pull = jnp.einsum("kab,kb->ka", free, pull.reshape(k, 6)).reshape(6 * k)
+    pull = jnp.einsum("kab,kb...->ka...", free, pull.reshape(k, 6, *pull.shape[1:])).reshape(pull.shape)
     return projected(free, information, free) + block_diagonal(rest), pull
 
 

@@ -31,8 +31,6 @@ class Layer(NamedTuple):
     Attributes:
         observed: (c, 2, 2 b, n) normalised image points.
         mask: (c, 2 b, n) which of them are seen.
-        slope: (c, 2, p, 2 b, n) derivative of the image points with respect to p errors of the camera's calibration,
-            over the standard deviations of these.
         begin: (c,) keyframe that a chunk begins with, a multiple of b.
         chunks: How many there are; those behind them are empty.
         prior: Of the inverse depths, (c, n) each.
@@ -40,7 +38,6 @@ class Layer(NamedTuple):
 
     observed: Float[Array, "c 2 v n"]
     mask: Bool[Array, "c v n"]
-    slope: Float[Array, "c 2 p v n"]
     begin: Int[Array, " c"]
     chunks: Int[Array, ""]
     prior: PointPrior
@@ -52,7 +49,7 @@ class Layer(NamedTuple):
 
     def chunk(self, index: Int[Array, ""] | int) -> "Chunk":
         """One of them."""
-        return Chunk(*(jax.tree.map(lambda x: x[index], each) for each in (*self[:4], self.prior)))
+        return Chunk(*(jax.tree.map(lambda x: x[index], each) for each in (*self[:3], self.prior)))
 
 
 class Chunk(NamedTuple):
@@ -60,7 +57,6 @@ class Chunk(NamedTuple):
 
     observed: Float[Array, "2 v n"]
     mask: Bool[Array, "v n"]
-    slope: Float[Array, "2 p v n"]
     begin: Int[Array, ""]
     prior: PointPrior
 

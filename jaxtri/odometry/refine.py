@@ -84,7 +84,7 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
         segment = Segment.of(odometry, first, end)
         keys = keyframes(odometry.settings, segment)
         last = poses[end - 1].T_camera_world
-        found = _Adjusted.of(odometry, segment, keys, progress) if len(keys) >= FEWEST else None
+        found = _Adjusted.of(odometry.settings, segment, keys, progress) if len(keys) >= FEWEST else None
         if found is None:
             parts.append({"frames": [first, end - 1], "refined": False})
         else:
@@ -134,11 +134,9 @@ class _Adjusted:
     statistics: dict[str, object]
 
     @classmethod
-    def of(cls, odometry: Odometry, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
+    def of(cls, settings: Settings, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
         """Those of a stretch; None where nothing finite came of it."""
-        settings = odometry.settings
-        assert settings is not None
-        pieces = Pieces.of(segment, keys, segment.slope(odometry.camera, keys) * float(settings.calibration))
+        pieces = Pieces.of(segment, keys)
         dtype, k = segment.u.dtype, room(len(keys))
         centre = -np.einsum("kji,kj->ki", segment.T[keys, :3, :3], segment.T[keys, :3, 3])
         farthest = int(np.argmax(np.linalg.norm(centre - centre[0], axis=1)))
@@ -177,7 +175,8 @@ class _Adjusted:
         }
         inflation = max(inflation, 1.0)
         spread = pieces.each(spread, (4, 3)) * np.sqrt(inflation)
-        poses = now.poses, covariance * inflation + response @ response.swapaxes(1, 2)
+        owed = float(settings.calibration) ** 2 * response @ response.swapaxes(1, 2)
+        poses = now.poses, covariance * inflation + owed
         looks = pieces.looks(residual, (2,)), distance / inflation
         return cls(segment, keys, pieces, noise, float(depth), *poses, X, spread, agreed, *looks, said)
 
@@ -295,7 +294,7 @@ def _begun(
 ) -> tuple[tuple[Layer, ...], tuple[Homogeneous, ...], Float[Array, ""]]:
     """The layers, the points by the first and last look at them, and the median depth of the scene."""
     found = []
-    for observed, mask, _, begin, _ in layers:
+    for observed, mask, begin, _ in layers:
 
         def one(part: tuple[Array, ...]) -> Looks:
             observed, mask, begin = part
@@ -310,8 +309,8 @@ def _begun(
     def start(first: Looks, layer: tuple[Array, ...]) -> tuple[Layer, Homogeneous]:
         rho = jnp.clip(first.inverse_depth, FAREST / depth, NEAREST / depth)
         prior = PointPrior(jnp.full_like(rho, 1 / depth), jnp.full_like(rho, VAGUE / depth))
-        observed, mask, slope, begin, chunks = layer
-        return Layer(observed, mask, slope, begin, chunks, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
+        observed, mask, begin, chunks = layer
+        return Layer(observed, mask, begin, chunks, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
 
     begun, points = zip(*map(start, found, layers), strict=True)
     return begun, points, depth

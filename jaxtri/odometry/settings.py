@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtri.checks import number, positive
+from jaxtri.checks import concrete, number, positive
 from jaxtri.errors import InputError
 from jaxtri.filters import ekf
 from jaxtri.geometry.camera import Camera
@@ -78,8 +79,8 @@ class Settings(eqx.Module):
             feature tracker of `jaxtri.vision` on real video. 0 is noise drawn anew in every frame: features that are
             found in each, and matched.
         calibration: Standard deviation of the focal length as a share of it, and of the principal point as a share of
-            the focal length: 0.003 by default, 1.5 pixels of 500, which is what a good calibration reaches. It is in
-            the covariances of `jaxtri.refine`. Higher for a camera that was guessed; 0 for one that is exact.
+            the focal length: 0.003 by default, 1.5 pixels of 500, which is what a good calibration reaches. The camera
+            stays as it is given; the covariances count this. Higher for one that was guessed; 0 for one that is exact.
         acceleration: Standard deviation of the camera's acceleration, in median scene depths per frame^2. Higher trusts
             the prediction less: it survives jerks and smooths less.
         angular_acceleration: Standard deviation of its angular acceleration, radians per frame^2. Higher and lower do
@@ -132,25 +133,35 @@ class Settings(eqx.Module):
     refinements: int = eqx.field(static=True, default=1)
 
     @classmethod
-    def of(cls, camera: Camera, *, noise_px: Float[Array, ""] | float = 0.4, passes: int = 8) -> "Settings":
+    def of(
+        cls,
+        camera: Camera,
+        *,
+        noise_px: Float[Array, ""] | float = 0.4,
+        calibration: Float[Array, ""] | float = 0.003,
+        passes: int = 8,
+    ) -> "Settings":
         """The defaults, for a camera whose tracks have a noise of `noise_px` pixels in each coordinate.
 
-        Raises `InputError` where `noise_px` is not positive or `passes` is below 1.
+        Raises `InputError` where `noise_px` is not positive, `calibration` is negative or `passes` is below 1.
         """
         positive("noise_px", noise_px, " of pixels")
+        given = concrete(calibration)
+        if given is not None and not ((given >= 0) & (given < np.inf)).all():
+            raise InputError(f"calibration is {given}; give a share of the focal length, 0 for an exact camera")
         if passes < 1:
             raise InputError(f"passes is {passes}; give at least 1")
         focal = jnp.sqrt(camera.fx * camera.fy)
         width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
 
-        def scalar(x: float) -> Array:
+        def scalar(x: Float[Array, ""] | float) -> Array:
             # In the camera's dtype: the fields' own converter takes JAX's default one.
             return jnp.asarray(x, focal.dtype)
 
         return cls(
             sigma=noise_px / focal,
             correlation=scalar(0.9),
-            calibration=scalar(0.003),
+            calibration=scalar(calibration),
             acceleration=scalar(0.2),
             angular_acceleration=scalar(0.2),
             keyframe_flow=0.026 * width / focal,

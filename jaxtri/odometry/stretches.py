@@ -2,13 +2,8 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.driver import Odometry, normalise
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.slots import Slotted
@@ -33,9 +28,8 @@ def segments(odometry: Odometry) -> list[tuple[int, int]]:
 
 
 class Segment(NamedTuple):
-    """The frames of a stretch: pixels and normalised points (t, n, 2), which are seen, and numbers of the tracks."""
+    """The frames of a stretch: normalised points (t, n, 2), which are seen, and the numbers of the tracks."""
 
-    pixels: np.ndarray
     u: np.ndarray
     seen: np.ndarray
     ids: np.ndarray
@@ -48,14 +42,12 @@ class Segment(NamedTuple):
         """Of frames of a run, as it recorded them."""
         tracks: list[Slotted] = odometry.tracks[first:end]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
-        pixels = np.stack([t.pixels.astype(dtype) for t in tracks])
-        u = np.stack([np.asarray(normalise(odometry.camera, each)) for each in pixels])
+        u = np.stack([np.asarray(normalise(odometry.camera, t.pixels.astype(dtype))) for t in tracks])
         seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
         poses = odometry.poses[first:end]
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
         times = np.array([p.time for p in poses]) / (odometry.frame_time or 1.0)
         return cls(
-            pixels,
             np.where(seen[..., None], u, 0.0),
             seen,
             np.where(seen, np.stack([t.ids for t in tracks]), -1),
@@ -63,14 +55,6 @@ class Segment(NamedTuple):
             times,
             np.array([p.status.measured for p in poses]),
         )
-
-    def slope(self, camera: Camera, keys: np.ndarray) -> np.ndarray:
-        """Derivatives (k, n, 2, 3) of what these frames show with respect to errors of the calibration.
-
-        Of the focal length as a share of it, and of the principal point, as shares of the focal length.
-        """
-        slope = np.stack([np.asarray(_slopes(camera, z)) for z in self.pixels[keys]])
-        return np.where(self.seen[keys][..., None, None], slope, 0.0)
 
 
 def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
@@ -86,21 +70,11 @@ def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
     return np.array(keys if keys[-1] == last else [*keys, last])
 
 
-@jax.jit
-def _slopes(camera: Camera, pixels: Float[Array, "n 2"]) -> Float[Array, "n 2 3"]:
-    def seen(errors: Array, z: Array) -> Array:
-        f, x, y = errors
-        moved = camera.fx * jnp.exp(f), camera.fy * jnp.exp(f), camera.cx + camera.fx * x, camera.cy + camera.fy * y
-        return eqx.tree_at(lambda c: (c.fx, c.fy, c.cx, c.cy), camera, moved).to_normalised(z)
-
-    return jax.vmap(jax.jacfwd(seen), in_axes=(None, 0))(jnp.zeros(3, pixels.dtype), pixels)
-
-
 class Pieces(NamedTuple):
     """Tracks cut where a layer of chunks cannot hold them, or where they are not seen, and where each piece went.
 
     Attributes:
-        layers: (observed, mask, slope, begin, count) of each layer, as `jaxtri.estimation.batch.Layer` has them.
+        layers: (observed, mask, begin, chunks) of each layer, as `jaxtri.estimation.batch.Layer` has them.
         ids: (p,) number of the track of each piece.
         layer, chunk, column: (p,) where it went.
         key, slot, piece: (o,) keyframe, slot and piece of each look.
@@ -116,8 +90,8 @@ class Pieces(NamedTuple):
     piece: np.ndarray
 
     @classmethod
-    def of(cls, segment: Segment, keys: np.ndarray, slope: np.ndarray) -> "Pieces":
-        """Those of the tracks that two keyframes in a row see; `slope` (k, n, 2, p) is that of a layer."""
+    def of(cls, segment: Segment, keys: np.ndarray) -> "Pieces":
+        """Those of the tracks that two keyframes in a row see."""
         places, last = room(len(keys)), SIZES[-1]
         key, slot = np.nonzero(segment.seen[keys])
         ids = segment.ids[keys][key, slot]
@@ -149,14 +123,12 @@ class Pieces(NamedTuple):
             starts = np.zeros(c, np.int32)
             starts[:count] = np.repeat(b * np.arange(len(chunks)), chunks)
             observed, mask = np.zeros((c, 2, 2 * b, n), segment.u.dtype), np.zeros((c, 2 * b, n), bool)
-            slopes = np.zeros((c, 2, slope.shape[3], 2 * b, n), segment.u.dtype)
             look = layer[piece] == number
             at = chunk[piece[look]]
             where = at, key[look] - starts[at], column[piece[look]]
             observed[where[0], :, where[1], where[2]] = segment.u[keys[key[look]], slot[look]]
-            slopes[where[0], :, :, where[1], where[2]] = slope[key[look], slot[look]]
             mask[where] = True
-            layers.append((observed, mask, slopes, starts, np.asarray(count, np.int32)))
+            layers.append((observed, mask, starts, np.asarray(count, np.int32)))
         return cls(layers, ids[first], layer, chunk, column, key, slot, piece)
 
     def each(self, of_layers: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
@@ -172,7 +144,7 @@ class Pieces(NamedTuple):
         found = np.zeros((len(self.key), *shape), of_layers[0].dtype)
         for number, x in enumerate(of_layers):
             here = self.layer[self.piece] == number
-            piece, begin = self.piece[here], self.layers[number][3]
+            piece, begin = self.piece[here], self.layers[number][2]
             found[here] = x[self.chunk[piece], self.key[here] - begin[self.chunk[piece]], ..., self.column[piece]]
         return found
 

@@ -20,7 +20,7 @@ from jaxtri.estimation.bundle import (
     Points,
     Reduced,
     Views,
-    block_diagonal,
+    calibration_pull,
     held,
     linearise,
     looks,
@@ -30,6 +30,7 @@ from jaxtri.estimation.bundle import (
     solver,
     without_length,
 )
+from jaxtri.estimation.precision import block_diagonal
 from jaxtri.geometry.pose import adjoint, identity, inverse_left_jacobian, local, relative, retract
 from jaxtri.odometry.measuring import FARTHEST
 from jaxtri.odometry.settings import Settings
@@ -56,7 +57,8 @@ class Window(NamedTuple):
         X: (4, n) homogeneous points of the world.
         known: (n,) points that were triangulated.
         information: (6k, 6k) what has left the window says of the poses' errors.
-        pull: (6k,) its right side: a cost of x' information x / 2 - pull' x for left perturbations x.
+        pull: (6k, 4) its right side: a cost of x' information x / 2 - pull' x for left perturbations x; and what errors
+            of the camera's calibration add to that (`jaxtri.estimation.bundle.calibration_pull`).
         origin: The first pose of all; with it the gauge is held as long as the first two keyframes stay.
         role: (k,) 1 for the first keyframe of all, 2 for the second, 0 for any other.
     """
@@ -69,7 +71,7 @@ class Window(NamedTuple):
     X: Float[Array, "4 n"]
     known: Bool[Array, " n"]
     information: Float[Array, "s s"]
-    pull: Float[Array, " s"]
+    pull: Float[Array, "s 4"]
     origin: SE3
     role: Int[Array, " k"]
 
@@ -81,7 +83,8 @@ class Refined(NamedTuple):
     of the poses.
 
     Attributes:
-        covariance: (6k, 6k) of the poses' errors, left perturbations (linear, angular), scene units and radians.
+        covariance: (6k, 6k) of the poses' errors, left perturbations (linear, angular), scene units and radians; what
+            the calibration is not known to (`Settings.calibration`) is in it.
         X: (4, n) homogeneous points.
         spread: (4, 3, n) their own errors, over sigma.
         lever: (6k, 3, n) what they owe to the poses.
@@ -125,7 +128,7 @@ def start(
         jnp.zeros((4, n), dtype),
         jnp.zeros(n, bool),
         jnp.zeros((6 * k, 6 * k), dtype),
-        jnp.zeros(6 * k, dtype),
+        jnp.zeros((6 * k, 4), dtype),
         one,
         jnp.zeros(k, jnp.int32).at[-2:].set(jnp.array([1, 2], jnp.int32)),
     )
@@ -154,7 +157,7 @@ def add(
         observed=jnp.concatenate([window.observed[:, 1:], observed.T[:, None]], axis=1),
         mask=jnp.concatenate([window.mask[1:], (visible & held)[None]]),
         information=jnp.pad(window.information[6:, 6:], ((0, 6), (0, 6))),
-        pull=jnp.pad(window.pull[6:], (0, 6)),
+        pull=jnp.pad(window.pull[6:], ((0, 6), (0, 0))),
         role=jnp.pad(window.role[1:], (0, 1)),
     )
     return _improved(settings, moved, visible, ~held, depth, steps)
@@ -170,7 +173,7 @@ class _Estimate(NamedTuple):
     free: Float[Array, "k 6 6"]  # what the gauge leaves of the poses' errors
     information: Float[Array, "s s"]  # with the gauge held
     pull: Float[Array, " s"]
-    carried: tuple[Float[Array, "s s"], Float[Array, " s"]]  # what has left the window says there
+    carried: tuple[Float[Array, "s s"], Float[Array, "s 4"]]  # what has left the window says there
     damping: Float[Array, ""]
 
 
@@ -195,7 +198,7 @@ def _improved(
         reduced = reduce(said, points, vague)
         carried = information, pull = _carried(window, poses)
         free = _free(window, poses)
-        equations = held(free, information + reduced.information, pull + reduced.pull)
+        equations = held(free, information + reduced.information, pull[:, 0] + reduced.pull)
         return _Estimate(poses, points, said, reduced, free, *equations, carried, damping)
 
     # Every step is taken: one that is taken or not by its cost would make steps in the result's derivative.
@@ -212,15 +215,19 @@ def _improved(
     best, _ = jax.lax.scan(step, begin, None, length=steps + 1)
     covariance = solver(best.information)(jnp.eye(6 * k, dtype=dtype))
     covariance = projected(best.free, (covariance + covariance.T) / 2, best.free)
+    said_of_it = calibration_pull(best.said, best.reduced, window.observed, settings.sigma)
+    response = settings.calibration * covariance @ (best.carried[1][:, 1:] + said_of_it)
+    covariance = covariance + response @ response.T
     spread = jnp.einsum("qsn,tsn->qtn", best.points.basis, best.reduced.root) / settings.sigma
     lever = best.reduced.cross * settings.sigma
     agree = jnp.sum(best.said.weights > AGREES, axis=0) >= 2
     usable = agree & (angle > settings.usable_parallax) & (best.points.inverse_depth > 0) & ~over
-    left = _left(window, best, vague, visible, over)
+    left = _left(settings, window, best, vague, visible, over)
     return left._replace(known=usable), Refined(covariance, best.points.X, spread, lever, angle, usable)
 
 
 def _left(
+    settings: Settings,
     window: Window,
     best: _Estimate,
     vague: PointPrior,
@@ -244,7 +251,8 @@ def _left(
     folded = window.mask & (over | (oldest & window.mask[0] & (index[:, None] < cut)))
     told = reduce(best.said, best.points, vague, folded)
     information, pull = best.carried
-    information, pull = information + told.information, pull + told.pull
+    of_calibration = calibration_pull(best.said, told, window.observed, settings.sigma, folded)
+    information, pull = information + told.information, pull + jnp.column_stack([told.pull, of_calibration])
     mask = (window.mask & ~folded & ~over).at[-1].set(visible)
     # The one that leaves comes first, and its place becomes empty.
     gone = jnp.where(leaving & ~oldest, middle, 0)
@@ -282,12 +290,13 @@ def _free(window: Window, poses: SE3) -> Float[Array, "k 6 6"]:
     return jax.vmap(one)(window.role, jnp.arange(k) < k - window.kept, poses)
 
 
-def _without_first(information: Float[Array, "s s"], pull: Float[Array, " s"]) -> tuple[Array, Array]:
+def _without_first(information: Float[Array, "s s"], pull: Float[Array, "s q"]) -> tuple[Array, Array]:
     """The first pose marginalised; zeros stand in its place."""
-    across = solver(information[:6, :6])(jnp.concatenate([information[:6, 6:], pull[:6, None]], axis=1))
-    rest = information[6:, 6:] - information[6:, :6] @ across[:, :-1]
-    rest, owed = (rest + rest.T) / 2, pull[6:] - information[6:, :6] @ across[:, -1]
-    return jnp.pad(rest, ((6, 0), (6, 0))), jnp.pad(owed, (6, 0))
+    s = len(pull)
+    across = solver(information[:6, :6])(jnp.concatenate([information[:6, 6:], pull[:6]], axis=1))
+    rest = information[6:, 6:] - information[6:, :6] @ across[:, : s - 6]
+    rest, owed = (rest + rest.T) / 2, pull[6:] - information[6:, :6] @ across[:, s - 6 :]
+    return jnp.pad(rest, ((6, 0), (6, 0))), jnp.pad(owed, ((6, 0), (0, 0)))
 
 
 def _gauge(poses: SE3) -> Float[Array, "s 7"]:
@@ -300,7 +309,7 @@ def _gauge(poses: SE3) -> Float[Array, "s 7"]:
     return jax.vmap(one)(poses).reshape(-1, 7)
 
 
-def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Array, " s"]]:
+def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Array, "s 4"]]:
     """What has left the window says about other poses: its information and pull.
 
     The derivative is corrected so that a similarity of the world changes as little there as it did before. Without,
@@ -314,7 +323,7 @@ def _carried(window: Window, poses: SE3) -> tuple[Float[Array, "s s"], Float[Arr
     size = jnp.sqrt(jnp.sum(now**2, axis=0))
     before, now = before / size, now / size
     A = A + (before - A @ now) @ solver(now.T @ now)(now.T)
-    return A.T @ window.information @ A, A.T @ (window.pull - window.information @ x)
+    return A.T @ window.information @ A, A.T @ window.pull.at[:, 0].add(-window.information @ x)
 
 
 def _begun(window: Window, depth: Float[Array, ""]) -> tuple[Points, Float[Array, " n"]]:

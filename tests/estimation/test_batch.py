@@ -50,8 +50,7 @@ def made(noise=0.0, seed=0):
             white[:, v] = np.where(again, 0.8 * white[:, v - 1] + 0.6 * white[:, v], white[:, v])
         observed = np.moveaxis(Z[:, :, :2] / Z[:, :, 2:] + white, 2, 1)
         prior = PointPrior(jnp.full((chunks, n), 0.2), jnp.full((chunks, n), 200.0))
-        slope = np.random.default_rng(7).normal(size=(chunks, 2, 2, 2 * size, n)) * SIGMA
-        layers.append(Layer(*map(jnp.asarray, (observed, mask, slope, begin, chunks - 1)), prior))
+        layers.append(Layer(*map(jnp.asarray, (observed, mask, begin, chunks - 1)), prior))
         truth.append(X[:-1])
     return Batch(tuple(layers), jnp.arange(K) < SEEN, jnp.asarray(FARTHEST)), poses, truth
 
@@ -148,11 +147,12 @@ def test_what_an_error_of_the_calibration_does_to_the_poses():
     problem, poses, _ = made()
     start = begun(problem, poses)
     response = jax.jit(batch.known)(problem, PLAIN, poses, start).calibration
-    error = jnp.asarray([1e-3, -2e-3])
+    error = np.array([1e-3, -2e-3, 1e-3])  # focal length, as a share; principal point, in focal lengths
 
     def moved(sign):
-        shift = [jnp.einsum("capvn,p->cavn", layer.slope, sign * error) for layer in problem.layers]
-        layers = [layer._replace(observed=layer.observed + s) for layer, s in zip(problem.layers, shift, strict=True)]
+        focal, *centre = sign * error
+        centre = np.array(centre)[:, None, None]
+        layers = [x._replace(observed=(x.observed - centre) / (1 + focal)) for x in problem.layers]
         return optimum(problem._replace(layers=tuple(layers)), PLAIN, poses, start, tolerance=1e-9, most=60).poses
 
     found = jax.vmap(lambda a, b: (a @ b.inverse()).log())(moved(1.0), moved(-1.0)) / 2
