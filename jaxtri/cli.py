@@ -37,6 +37,8 @@ class Track:
     """Frames that two segments share (with `--base paper`)."""
     noise_px: float = 0.4
     """Standard deviation of a tracked point, pixels."""
+    calibration_error: float | None = None
+    """What the focal length may be off by, as a share of it (0.003; 0.05 with `--fov`): it is in the covariances."""
     features: int = 800
     """Features followed at once."""
     min_parallax: float | None = None
@@ -193,18 +195,18 @@ def _camera(options: Track, size: tuple[int, int]) -> "Camera":
 
 def _how(camera: "Camera", options: Track) -> dict[str, Any]:
     """The keyword arguments that `odometry.run.track` and `warm_up` have in common."""
-    from jaxtri.odometry.settings import Base, Settings, StartSettings
+    from jaxtri.odometry.settings import CALIBRATED, Base, Settings, StartSettings
     from jaxtri.vision.klt import KLTSettings
 
     base = Base(options.base)
     changes = {} if options.min_parallax is None else {"parallax_deg": options.min_parallax}
     poselib = options.starts == "poselib"
-    settings = Settings.of(camera, noise_px=options.noise_px)
-    if options.fov is not None:
-        settings = Settings.of(camera, noise_px=options.noise_px, calibration=GUESS)
+    calibration = CALIBRATED if options.fov is None else GUESS
+    if options.calibration_error is not None:
+        calibration = options.calibration_error
     return {
         "base": base,
-        "settings": settings,
+        "settings": Settings.of(camera, noise_px=options.noise_px, calibration=calibration),
         "start": StartSettings.of(base, overlap=options.overlap, poselib=poselib, **changes),
         "klt": KLTSettings(capacity=options.features),
     }

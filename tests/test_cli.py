@@ -91,6 +91,12 @@ def test_a_video_file_with_a_field_of_view_and_a_place(sequence, tmp_path, capsy
     fov = str(np.rad2deg(2 * np.arctan(320 / 560)))
     main(["track", str(clip), "--fov", fov, "--out", str(out), "--quiet", "--place", "400", "380"])
     assert read_tum(out / "trajectory.txt").times[1] == pytest.approx(0.04)
+    # A field of view is a guess, and the covariances count it as one.
+    exact = ["--fov", fov, "--calibration-error", "0", "--out", str(tmp_path / "exact"), "--quiet", "--no-overlay"]
+    main(["track", str(clip), *exact])
+    runs = [json.loads((folder / "run.json").read_text()) for folder in (out, tmp_path / "exact")]
+    guessed, known = (max(run["statistics"]["evidence_of_frame"]["position_sd"][-5:]) for run in runs)
+    assert guessed > known
     capsys.readouterr()
     outside = ["track", clip, "--fov", fov, "--out", out, "--quiet", "--place", "4000", "380"]
     assert "outside the image" in fails(outside, capsys)

@@ -63,6 +63,9 @@ class Status(IntEnum):
         return self in (Status.TRACKING, Status.UNCERTAIN, Status.RESTARTED)
 
 
+CALIBRATED = 0.003  # what a good calibration knows the focal length to, as a share of it
+
+
 class Settings(eqx.Module):
     """What a tracker run may tune; `Settings.of(camera)` fills it from pixels.
 
@@ -138,7 +141,7 @@ class Settings(eqx.Module):
         camera: Camera,
         *,
         noise_px: Float[Array, ""] | float = 0.4,
-        calibration: Float[Array, ""] | float = 0.003,
+        calibration: Float[Array, ""] | float = CALIBRATED,
         passes: int = 8,
     ) -> "Settings":
         """The defaults, for a camera whose tracks have a noise of `noise_px` pixels in each coordinate.
