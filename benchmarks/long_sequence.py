@@ -3,11 +3,11 @@
     python benchmarks/long_sequence.py
 
 A camera slides past points that it never sees again, 2.4 new ones a frame; a track lives some 80 frames, and drifts
-by 0.05 px a frame. Seconds of the tracker on given tracks and of `jaxtri.refine`, once compiled, the most memory that the
-process had before and after it, and the errors.
+by 0.05 px a frame. Seconds of the tracker on given tracks and of `jaxtri.refine`, once compiled, the most memory that
+the process had before and after it, and the errors.
 
-Last answer (2 cores, JAX 0.10, float64; keyframes and looks, steps, seconds of tracking and of refinement, megabytes before
-and after, ATE in % causal and refined):
+Last answer (2 cores, JAX 0.10, float64; keyframes, looks, steps, seconds of tracking and of refinement, megabytes
+before and after, ATE in % causal and refined):
     750 frames    189   57,943  4   48.5 1.60   1220 1343   .0077 .0054
     1,500         376  115,389  5   16.7 2.90   1347 1493   .0193 .0117
     3,000         751  230,899  5   29.0 6.17   1498 1720   .0159 .0132
