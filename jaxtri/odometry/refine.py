@@ -234,7 +234,9 @@ class _Adjusted:
         arguments = (before, share, sd, self.X[which], observed, which >= 0, np.sqrt(variance))
         rest = np.zeros(TOGETHER - len(frames), int)
         padded = [jnp.asarray(np.concatenate([x, x[rest]])) for x in arguments]
-        said = _measured(settings, self.depth, self.poses, jnp.asarray(self.covariance), *padded)
+        covariances = np.zeros((len(self.poses.wxyz_xyz), 6, 6), self.covariance.dtype)  # as many as there are places
+        covariances[: len(self.keys)] = self.covariance
+        said = _measured(settings, self.depth, self.poses, jnp.asarray(covariances), *padded)
         return [*(np.asarray(x)[: len(frames)] for x in said), which >= 0]
 
     def _kept(

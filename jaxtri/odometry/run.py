@@ -204,6 +204,7 @@ def warm_up(
     settings: Settings | None = None,
     start: StartSettings | None = None,
     klt: KLTSettings | None = None,
+    refine: bool = False,
 ) -> None:
     """Compile what `track` needs, with the same arguments, by following a few made-up tracks.
 
@@ -215,11 +216,13 @@ def warm_up(
     w, h = camera.width or 2 * float(camera.cx), camera.height or 2 * float(camera.cy)
     pixels = rng.uniform([0.2 * w, 0.2 * h], [0.8 * w, 0.8 * h], (n, 2))
     depth = rng.uniform(1, 2, n)
-    odometry = Odometry(camera, settings, base, start, capacity=n)
+    odometry = Odometry(camera, settings, base, start, record=refine, capacity=n)
     for k in range(6):
         shift = np.stack([0.04 * w * k / depth, np.zeros(n)], axis=1)
         odometry.add(pixels + shift, np.ones(n, bool), float(k))
     odometry.points()
+    if refine:
+        refine_run(odometry)
 
 
 def follow_tracks(

@@ -31,7 +31,7 @@ def demo(out: Path, said: Mapping[str, object], *, frames: int = 100, seed: int 
     folder = out / "sequence"
     footage = laboratory(frames, seed)
     with ThreadPoolExecutor(1) as pool:  # the filters compile while the frames are rendered
-        ready = pool.submit(warm_up, footage.camera)
+        ready = pool.submit(warm_up, footage.camera, refine=True)
         camera = write_footage(folder, footage, seed, progress=progress)
         ready.result()
     truth = read_tum(folder / "groundtruth.txt")

@@ -3,6 +3,8 @@ import pytest
 from tracks import make, sideways
 
 from jaxtri.errors import InitialisationError, InputError
+from jaxtri.estimation import batch
+from jaxtri.odometry import refine as module
 from jaxtri.odometry import stretches
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.refine import refine
@@ -91,6 +93,18 @@ def test_long_sequences_are_cut_into_blocks(run, monkeypatch):
     cut = refine(odometry)
     assert cut.statistics["parts"][0]["tracks"] > whole.statistics["parts"][0]["tracks"]
     assert errors(tracks, cut.trajectory()).ate_percent < 1.5 * errors(tracks, whole.trajectory()).ate_percent + 0.02
+
+
+def test_another_sequence_compiles_nothing(run):
+    """Other frames, keyframes, tracks and looks: what one refinement has compiled serves the next one."""
+    programs = batch._equations, batch._stepped, batch._known, module._begun, module._measured
+    first = refine(run[1])
+    compiled = [program._cache_size() for program in programs]
+    assert all(compiled)
+    tracks = drifting(30, seed=3, px=0.1)
+    second = refine(follow_tracks(tracks.camera, tracks.pixels, tracks.visible, record=True))
+    assert len(first.keyframes) != len(second.keyframes)
+    assert [program._cache_size() for program in programs] == compiled
 
 
 def test_each_stretch_is_refined_by_itself_and_hangs_on_the_one_before():
