@@ -172,7 +172,7 @@ def _overlay(options: Track, run: Any, camera: "Camera", source: Path | str, fps
 
 def _check(options: Track) -> None:
     """Numbers and words that no run can use, named before anything is opened."""
-    least = {"features": 50, "overlap": 1, "max_frames": 1, "min_parallax": 0, "noise_px": 1e-6}
+    least = {"features": 50, "overlap": 1, "max_frames": 1, "min_parallax": 0, "noise_px": 1e-6, "calibration_error": 0}
     for name, low in least.items():
         value = getattr(options, name)
         if value is not None and not low <= value < float("inf"):
@@ -180,6 +180,8 @@ def _check(options: Track) -> None:
     for name, words in {"base": ("tracks", "inherit", "paper"), "starts": ("opencv", "poselib")}.items():
         if getattr(options, name) not in words:
             raise InputError(f"--{name} {getattr(options, name)}: choose one of {', '.join(words)}")
+    if options.out.exists() and not options.out.is_dir():
+        raise InputError(f"--out {options.out} is a file: give a folder")
 
 
 def _camera(options: Track, size: tuple[int, int]) -> "Camera":

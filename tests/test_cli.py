@@ -117,7 +117,8 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
     assert "fov" in track(sequence, "--fov", "190").lower()
     assert "choose one of" in track(sequence, "--camera", camera, "--base", "none")
     assert "at least two" in track(sequence, "--camera", camera, "--max-frames", "1")
-    for option, value in (("--features", "-5"), ("--noise-px", "nan"), ("--overlap", "0"), ("--max-frames", "0")):
+    wrong = ("--features", "-5"), ("--noise-px", "nan"), ("--overlap", "0"), ("--max-frames", "0")
+    for option, value in (*wrong, ("--calibration-error", "-1")):
         assert option in track(sequence, "--camera", camera, option, value)
     for name, value in (("fx", None), ("fx", -560.0), ("cy", float("inf")), ("model", "pushbroom")):
         entries = json.loads(camera.read_text())
@@ -129,6 +130,11 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
         assert name in track(sequence, "--camera", tmp_path / "bad.json") or str(value) in track(
             sequence, "--camera", tmp_path / "bad.json"
         )
+    (tmp_path / "words.yaml").write_text("a calibration\nof: [another, kind\n")
+    assert "neither a JSON object" in track(sequence, "--camera", tmp_path / "words.yaml")
+    file = tmp_path / "file"
+    file.touch()
+    assert "--out" in fails(["track", sequence, "--camera", camera, "--out", file, "--quiet"], capsys)
     entries = json.loads(camera.read_text()) | {"width": 320, "height": 240}
     (tmp_path / "small.json").write_text(json.dumps(entries))
     assert "320" in track(sequence, "--camera", tmp_path / "small.json")

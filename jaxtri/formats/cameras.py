@@ -12,6 +12,8 @@ from jaxtri.errors import CameraError
 from jaxtri.formats.files import PathLike, read_text
 from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
 
+NEITHER = "neither a JSON object nor OpenCV or ROS calibration YAML or XML"
+
 _BROWN = ("plumb_bob", "radtan", "opencv_radtan", "radial-tangential", "rational_polynomial", "brown_conrady")
 _FISHEYE = ("fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "equidistant")
 _PINHOLE = ("pinhole", "opencv", "none")
@@ -104,9 +106,9 @@ def _opencv_entries(text: str) -> dict[str, Any]:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         entries = value(storage.root())
     except (cv2.error, SystemError) as error:
-        raise ValueError(f"OpenCV: {error}") from error
+        raise ValueError(NEITHER) from error
     if not isinstance(entries, dict):
-        raise ValueError("neither a JSON object nor OpenCV or ROS calibration YAML or XML")
+        raise ValueError(NEITHER)
     return entries
 
 
