@@ -215,7 +215,8 @@ def _improved(
     best, _ = jax.lax.scan(step, begin, None, length=steps + 1)
     covariance = solver(best.information)(jnp.eye(6 * k, dtype=dtype))
     covariance = projected(best.free, (covariance + covariance.T) / 2, best.free)
-    said_of_it = calibration_pull(best.said, best.reduced, window.observed, settings.sigma)
+    # Without its own derivative, whose reverse form is NaN on some sequences: that of the covariance lacks this part.
+    said_of_it = jax.lax.stop_gradient(calibration_pull(best.said, best.reduced, window.observed, settings.sigma))
     response = settings.calibration * covariance @ (best.carried[1][:, 1:] + said_of_it)
     covariance = covariance + response @ response.T
     spread = jnp.einsum("qsn,tsn->qtn", best.points.basis, best.reduced.root) / settings.sigma
@@ -251,7 +252,7 @@ def _left(
     folded = window.mask & (over | (oldest & window.mask[0] & (index[:, None] < cut)))
     told = reduce(best.said, best.points, vague, folded)
     information, pull = best.carried
-    of_calibration = calibration_pull(best.said, told, window.observed, settings.sigma, folded)
+    of_calibration = jax.lax.stop_gradient(calibration_pull(best.said, told, window.observed, settings.sigma, folded))
     information, pull = information + told.information, pull + jnp.column_stack([told.pull, of_calibration])
     mask = (window.mask & ~folded & ~over).at[-1].set(visible)
     # The one that leaves comes first, and its place becomes empty.
