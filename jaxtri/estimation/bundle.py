@@ -296,14 +296,13 @@ def calibration_pull(
     Source: Schmidt 1966; Bierman 1977, chapter VIII.
     """
     k, _, n = said.residual.shape
-    p = 3
     # Derivative of the normalised image points, and so of the residuals: of (pixel - centre) / focal length.
     centre = jnp.broadcast_to(jnp.eye(2, dtype=sigma.dtype)[None, :, :, None], (k, 2, 2, n))
     common = -jnp.concatenate([jnp.moveaxis(observed, 0, 1)[:, None], centre], axis=1) / sigma
     weights = said.weights if mask is None else jnp.where(mask, said.weights, 0.0)
     common = jnp.where((weights > 0)[:, None, None], common, 0.0)
     heavy = Precision.of(weights, said.kept) @ common
-    direct = jnp.einsum("kean,kpan->kep", said.pose, heavy).reshape(6 * k, p)
+    direct = jnp.einsum("kean,kpan->kep", said.pose, heavy).reshape(6 * k, 3)
     own = jnp.einsum("ksan,kpan->psn", said.point, heavy)
     return direct - jnp.einsum("etn,ptn->ep", reduced.cross, jnp.einsum("tsn,psn->ptn", reduced.root, own))
 

@@ -62,8 +62,7 @@ class Chunk(NamedTuple):
 
     def of(self, each: Any) -> Any:
         """What it needs of something of every keyframe."""
-        v = len(self.mask)
-        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, self.begin, v), each)
+        return part_of(each, self.begin, len(self.mask))
 
     def views(self, noise: Noise) -> Views:
         """What is seen in it."""
@@ -80,6 +79,11 @@ class Chunk(NamedTuple):
     def owed(self, points: Points) -> Float[Array, ""]:
         """To the prior."""
         return jnp.sum(((self.prior.mean - points.inverse_depth) / self.prior.sd) ** 2)
+
+
+def part_of(each: Any, begin: Int[Array, ""], count: int) -> Any:
+    """Of something of every keyframe, that of so many from one on."""
+    return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, begin, count), each)
 
 
 class Batch(NamedTuple):

@@ -21,7 +21,7 @@ from jaxtri.estimation import batch
 from jaxtri.estimation.batch import Estimate
 from jaxtri.estimation.bundle import Looks, PointPrior, Views, looks, seen_from
 from jaxtri.estimation.bundle import Points as Homogeneous
-from jaxtri.estimation.layers import Batch, Layer, Noise
+from jaxtri.estimation.layers import Batch, Layer, Noise, part_of
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import adjoint, exp_pose, local, multiply, relative
 from jaxtri.models.base_pairs import BasePairs, BasePoint
@@ -125,7 +125,7 @@ class _Adjusted:
     noise: Noise
     depth: float
     poses: SE3
-    covariance: np.ndarray  # (k, 6, 6)
+    covariance: np.ndarray  # (k, 6, 6), of as many places as `poses` has
     X: np.ndarray  # (p, 4) homogeneous points
     spread: np.ndarray  # (p, 4, 3) their own errors, over sigma
     agreed: np.ndarray  # (p,) points that at least two looks agree on
@@ -154,7 +154,7 @@ class _Adjusted:
             bar.update()
         bar.close()
         known = batch.known(problem, noise, now.poses, now.points)
-        covariance, response = (np.asarray(x)[: len(keys)] for x in known[:2])
+        covariance, response = (np.asarray(x) for x in known[:2])
         if not (np.isfinite(covariance).all() and np.isfinite(np.asarray(now.poses.wxyz_xyz)).all()):
             return None
         X = pieces.each([np.asarray(p.X) for p in now.points], (4,))
@@ -203,7 +203,7 @@ class _Adjusted:
         distance = _over_found(self.distance, agree)
         used, measured = (np.bincount(x, minlength=count) for x in (key[agree], key))
         nis = np.bincount(key[agree], weights=distance[agree], minlength=count)
-        put(self.keys, np.asarray(_matrices(self.poses))[:count], self.covariance, used, nis, measured)
+        put(self.keys, np.asarray(_matrices(self.poses))[:count], self.covariance[:count], used, nis, measured)
         between = np.setdiff1d(np.arange(len(before)), self.keys)
         if not len(between):
             return found
@@ -234,9 +234,7 @@ class _Adjusted:
         arguments = (before, share, sd, self.X[which], observed, which >= 0, np.sqrt(variance))
         rest = np.zeros(TOGETHER - len(frames), int)
         padded = [jnp.asarray(np.concatenate([x, x[rest]])) for x in arguments]
-        covariances = np.zeros((len(self.poses.wxyz_xyz), 6, 6), self.covariance.dtype)  # as many as there are places
-        covariances[: len(self.keys)] = self.covariance
-        said = _measured(settings, self.depth, self.poses, jnp.asarray(covariances), *padded)
+        said = _measured(settings, self.depth, self.poses, jnp.asarray(self.covariance), *padded)
         return [*(np.asarray(x)[: len(frames)] for x in said), which >= 0]
 
     def _kept(
@@ -300,8 +298,7 @@ def _begun(
 
         def one(part: tuple[Array, ...]) -> Looks:
             observed, mask, begin = part
-            here = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, begin, len(mask)), poses)
-            return looks(here, Views(observed, mask))
+            return looks(part_of(poses, begin, len(mask)), Views(observed, mask))
 
         found.append(jax.lax.map(one, (observed, mask, begin)))
     rho, angle = (jnp.concatenate([getattr(f, name).ravel() for f in found]) for name in ("inverse_depth", "angle"))

@@ -74,7 +74,7 @@ class Pieces(NamedTuple):
     """Tracks cut where a layer of chunks cannot hold them, or where they are not seen, and where each piece went.
 
     Attributes:
-        layers: (observed, mask, begin, chunks) of each layer, as `jaxtri.estimation.batch.Layer` has them.
+        layers: (observed, mask, begin, chunks) of each layer, as `jaxtri.estimation.layers.Layer` has them.
         ids: (p,) number of the track of each piece.
         layer, chunk, column: (p,) where it went.
         key, slot, piece: (o,) keyframe, slot and piece of each look.
