@@ -166,6 +166,7 @@ class _Passes(NamedTuple):
     considered: Bool[np.ndarray | Array, " d"] | None
     robust: Robust | None
     linearisations: int
+    begin: Float[Array, " d"] | None
 
     def correct(self, error: Float[Array, " d"]) -> Float[Array, " d"]:
         """The error without its considered components."""
@@ -177,7 +178,8 @@ class _Passes(NamedTuple):
         # A loop, all of it: another linearisation in the program would double the time its gradient takes to compile.
         zero, matrix = jnp.zeros((), P.dtype), jnp.zeros((len(support), len(support)), P.dtype)
         valid, each = self.mask.astype(P.dtype), jnp.zeros(len(self.mask), P.dtype)
-        first = _Pass(jnp.zeros(len(P), P.dtype), matrix, Inverse(matrix, zero), valid, self.mask, each, zero, zero)
+        begin = jnp.zeros(len(P), P.dtype) if self.begin is None else self.begin
+        first = _Pass(begin, matrix, Inverse(matrix, zero), valid, self.mask, each, zero, zero)
         return jax.lax.fori_loop(0, self.linearisations, lambda k, found: self._one(k, found.optimal), first)
 
     def _one(self, k: Array, before: Array) -> _Pass:
@@ -210,6 +212,7 @@ def update(
     passes: int | None = None,
     robust: Robust | None = None,
     noise_scale: Float[Array, " n"] | None = None,
+    begin: Float[Array, " d"] | None = None,
 ) -> tuple[Belief[Mean], Diagnostics]:
     """The belief after the measurements of one frame.
 
@@ -217,7 +220,8 @@ def update(
     measurements of all items; `mask` False leaves an item out, by default none. `passes` counts the linearisations
     (Gauss-Newton on the posterior, Bell & Cathey 1993): one is the plain EKF, 4 the default. With `robust` the passes
     before the last bring the weights down, and the default is `robust.passes`. `noise_scale` is the standard deviation
-    of each item's noise over what the model says, where something more is known of it.
+    of each item's noise over what the model says, where something more is known of it. `begin` is the error of the
+    prediction at which the first pass linearises, zero by default: `jaxtri.filters.consensus`.
 
     Raises `InputError` where shapes or kinds do not fit, `passes` is below 1, a covariance is none, or the model's
     sigma is not positive; warns (`UnitsWarning`) where normalised image points are clearly pixels.
@@ -234,6 +238,7 @@ def update(
         considered,
         robust,
         count_passes(passes, robust),
+        begin,
     )
     last = passes_.run()
     covariance, final = passes_.prior.posterior(last.A, last.inverse), passes_.correct(last.optimal)

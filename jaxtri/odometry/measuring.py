@@ -1,13 +1,14 @@
 """One frame measured, whichever base frames its tracks stand on: predict, update, and judge what came of it."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxtri.filters import ekf
+from jaxtri.filters import consensus, ekf
 from jaxtri.filters.model import Mean
+from jaxtri.filters.projective import Moments, Projective
 from jaxtri.models.depth import Depth
 from jaxtri.odometry.settings import Settings, Status
 
@@ -57,9 +58,13 @@ class Measured(NamedTuple):
     diagnostics: ekf.Diagnostics
 
 
+class Transfer(ekf.Model[Mean], Projective[Mean], Protocol):
+    """A model whose measurements are a linear map and a division."""
+
+
 def measure(
     settings: Settings,
-    model: ekf.Model[Mean],
+    model: Transfer[Mean],
     before: ekf.Belief[Mean],
     items: PyTree[Array],
     observed: Float[Array, "n 2"],
@@ -73,9 +78,12 @@ def measure(
     `observed` are normalised image points, `dt` is in frames, `coasted` the frames since the last update that was
     taken, `scale` what `noise_scale` gives.
     """
-    predicted = ekf.predict(model, before, dt)
+    predicted, items = ekf.predict(model, before, dt), ekf.prepare(model, items, mask)
+    assert isinstance(items, Moments)
+    robust = settings.robust
+    begin = consensus.begin(model, predicted, items, observed, mask, robust, noise_scale=scale)
     updated, said = ekf.update(
-        model, predicted, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
+        model, predicted, items, observed, mask, passes=settings.passes, robust=robust, noise_scale=scale, begin=begin
     )
     count = jnp.sum(mask).astype(settings.minimum.dtype)
     taken = said.used >= jnp.maximum(settings.minimum, LEAST_SHARE * count)

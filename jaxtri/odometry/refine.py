@@ -231,7 +231,10 @@ class _Adjusted:
         # Between two known poses: so far the path is bent by an acceleration as large as the filter takes it to be.
         bend = ((t - t0) * (t1 - t) / 2)[:, None]
         sd = bend * np.repeat([float(settings.acceleration) * self.depth, float(settings.angular_acceleration)], 3)
-        arguments = (before, share, sd, self.X[which], observed, which >= 0, np.sqrt(variance))
+        # Looked for where the filter saw it from the nearer keyframe: that path knows of a jump, the straight one not.
+        near = before + (share >= 0.5)
+        carried = self.segment.T[frames] @ np.linalg.inv(self.segment.T[self.keys[near]])
+        arguments = (before, share, near, carried, sd, self.X[which], observed, which >= 0, np.sqrt(variance))
         rest = np.zeros(TOGETHER - len(frames), int)
         padded = [jnp.asarray(np.concatenate([x, x[rest]])) for x in arguments]
         said = _measured(settings, self.depth, self.poses, jnp.asarray(self.covariance), *padded)
@@ -242,15 +245,16 @@ class _Adjusted:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The piece (t, n) in each slot, -1 for none; what it errs by in a frame, and the variance of that, over sigma.
 
-        An autoregression between two of its values, or beside one: a bridge.
+        An autoregression between two of its values, or beside one: a bridge. A look that is an outlier is none.
         """
+        agree = self.distance < float(self.noise.scale)
         ids, seen, phi = self.segment.ids, self.segment.seen[frames], float(self.noise.correlation)
         place = np.full((len(self.keys), seen.shape[1]), -1)
         place[self.pieces.key, self.pieces.slot] = np.arange(len(self.pieces.key))
 
         def at(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             look = place[index]
-            there = seen & (ids[frames] == ids[self.keys[index]]) & (look >= 0)
+            there = seen & (ids[frames] == ids[self.keys[index]]) & (look >= 0) & agree[look]
             return np.where(there, self.pieces.piece[look], -1), self.residual[look]
 
         (left, r0), (right, r1) = at(before), at(before + 1)
@@ -327,17 +331,17 @@ def _measured(
     model = BasePairs(settings.sigma, settings.acceleration * depth, settings.angular_acceleration)
 
     def one(frame: tuple[Array, ...]) -> tuple[Array, ...]:
-        before, share, sd, X, observed, mask, scale = frame
+        before, share, index, carried, sd, X, observed, mask, scale = frame
         a, b = (jax.tree.map(lambda x, i=i: x[i], poses) for i in (before, before + 1))
         mean = multiply(exp_pose(share * local(a, b)), a)
         still = jnp.ones(6, sd.dtype)
         belief = ekf.Belief(Twist(mean, jnp.zeros(6, sd.dtype)), jnp.diag(jnp.concatenate([sd**2, still])))
         items = BasePoint(X, jnp.zeros((*X.shape, 0), X.dtype))
-        belief, said = ekf.update(
-            model, belief, items, observed, mask, passes=settings.passes, robust=settings.robust, noise_scale=scale
-        )
+        near = jax.tree.map(lambda x: x[index], poses)
+        begin = jnp.pad(local(mean, multiply(SE3.from_matrix(carried), near)), (0, 6))
+        passes = {"passes": settings.passes, "robust": settings.robust, "begin": begin}
+        belief, said = ekf.update(model, belief, items, observed, mask, noise_scale=scale, **passes)
         pose = belief.mean.pose
-        near, index = jax.tree.map(lambda x, y: jnp.where(share < 0.5, x, y), (a, before), (b, before + 1))
         along = adjoint(relative(near, pose))
         owed = along @ covariances[index] @ along.T
         return pose.as_matrix(), belief.covariance[:6, :6], owed, said.distance

@@ -11,6 +11,8 @@ from jaxtri.errors import ResolutionChangeError
 
 STEPS, CLOSE = 30, 0.003  # optical flow ends after so many steps, or when a step is shorter than so many pixels
 BLOCK = 5  # pixels across, over which the strength of a corner is summed: a corner, and not the noise of one pixel
+LOST = 0.5  # share of the features below which the flow is sought again from elsewhere
+COARSE, TILES, FLAT = 160, 3, 2.0  # pixels across, tiles each way, and deviation of grey levels that says nothing
 MOST = 0.9  # share of the points whose flow the way back must reach: for the few longest all would take a level more
 
 
@@ -116,10 +118,10 @@ class KLT:
         error, eigenvalue = np.full((2, self.settings.capacity), np.nan)
         if self._previous is not None and self._alive.any():
             slots = np.flatnonzero(self._alive)
-            moved, ok, *quality = self._flow(self._previous, gray, self._pixels[slots], None, self.settings.levels)
+            moved, ok, *quality = self._follow(self._previous, gray, self._pixels[slots])
             self._pixels[slots] = moved
             error[slots], eigenvalue[slots] = quality
-            self._alive[slots] = ok & self._inside(moved)
+            self._alive[slots] = ok
             self._realign(gray, error, eigenvalue)
             self._separate()
         fresh = np.zeros(self.settings.capacity, bool)
@@ -132,6 +134,23 @@ class KLT:
     def drop(self, ids: np.ndarray) -> None:
         """Give up the features of these numbers: the filter found them to be outliers."""
         self._alive &= ~np.isin(self._ids, ids)
+
+    def _follow(self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The flow from frame to frame, of features that stay inside; as of `_flow`.
+
+        Where it loses most of them (a frame is missing, the camera is thrown about) it is sought again from where the
+        image as a whole has gone, and the one that keeps more of them is taken.
+        """
+
+        def flow(guess: np.ndarray | None) -> tuple[np.ndarray, ...]:
+            moved, ok, *quality = self._flow(a, b, pixels, guess, self.settings.levels)
+            return moved, ok & self._inside(moved), *quality
+
+        found = flow(None)
+        if found[1].mean() < LOST:
+            again = flow(pixels + _shift(a, b))
+            found = max(found, again, key=lambda f: f[1].sum())
+        return found
 
     def _flow(
         self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray, guess: np.ndarray | None, levels: int
@@ -255,3 +274,18 @@ def _mosaic(patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     centre = np.stack([column, row], axis=1).astype(np.float32) * side + side // 2
     image = tiles.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, columns * side)
     return image, centre
+
+
+def _shift(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """By how many pixels (x, y) the image has moved from `a` to `b`: that of the part that is found again best."""
+    scale = COARSE / max(a.shape)
+    small, other = (cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for x in (a, b))
+    h, w = (n // TILES for n in small.shape[:2])
+    best, shift = 0.0, np.zeros(2)
+    for y, x in np.ndindex(TILES, TILES):
+        tile = small[y * h : (y + 1) * h, x * w : (x + 1) * w]
+        if tile.std() > FLAT:
+            _, score, _, at = cv2.minMaxLoc(cv2.matchTemplate(other, tile, cv2.TM_CCOEFF_NORMED))
+            if score > best:
+                best, shift = score, np.array([at[0] - x * w, at[1] - y * h]) / scale
+    return shift.astype(np.float32)

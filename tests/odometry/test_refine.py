@@ -64,6 +64,25 @@ def test_refined_poses_are_nearer_and_the_rest_stays(run):
     assert part["converged"]
 
 
+def test_frames_beside_a_jump_between_two_keyframes():
+    """A turn of 16 degrees from one frame to the next, which two fifths of the tracks do not survive."""
+    t, rng = np.arange(40)[:, None], np.random.default_rng(0)
+    jump = (t >= 21) * np.array([0.15, 0.0, 0.1])
+    turn = t * [0.0, 1e-3, 0.0] + (t >= 21) * [0.0, np.deg2rad(16), 0.0]
+    tracks = make(t * [0.03, 0.002, 0.004] + jump, turn, noise_px=0.1)
+    wrong = np.flatnonzero(rng.random(tracks.pixels.shape[1]) < 0.45)
+    tracks.pixels[21:, wrong] += np.array([200.0, -40.0]) + rng.normal(scale=30, size=(len(wrong), 2))
+    odometry = follow_tracks(tracks.camera, tracks.pixels, tracks.visible, record=True)
+    found = refine(odometry)
+    beside = {18, 19, 20} - set(found.keyframes)
+    assert beside
+    for k in beside:
+        assert found.poses[k].status is Status.TRACKING
+        assert found.poses[k].used > 0.9 * found.poses[k].measured
+    assert errors(tracks, odometry.trajectory()).ate_percent < 0.3
+    assert errors(tracks, found.trajectory()).ate_percent < 0.15
+
+
 @pytest.mark.parametrize("noise_px", [0.05, 0.4])
 def test_errors_are_no_larger_than_they_are_said_to_be(noise_px):
     """NEES of the rotation of some frames: the noise is found where it was assumed too small, and never taken back."""

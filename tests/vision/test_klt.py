@@ -36,6 +36,21 @@ def test_sub_pixel_motion_is_followed_without_drift():
     assert np.median(np.linalg.norm(error, axis=1)) < 0.05
 
 
+@pytest.mark.parametrize("shift", [(-190.0, 12.0), (60.0, -140.0)])
+def test_features_are_followed_where_the_image_jumps(shift):
+    image, klt = texture(size=(480, 640)), KLT(SETTINGS)
+    rng = np.random.default_rng(1)
+    noisy = [
+        (x + rng.normal(scale=3, size=x.shape)).clip(0, 255).astype(np.uint8) for x in (image, moved(image, shift))
+    ]
+    first, second = (klt.track(x) for x in noisy)
+    there = first.pixels + shift
+    stays = first.visible & (there > 20).all(axis=1) & (there < [620, 460]).all(axis=1)
+    kept = stays & second.visible & (first.ids == second.ids)
+    assert kept.sum() > 0.8 * stays.sum() > 40
+    assert np.percentile(np.linalg.norm(second.pixels - there, axis=1)[kept], 95) < 0.5
+
+
 def test_slots_ids_and_births():
     image, klt = texture(), KLT(SETTINGS)
     before = klt.track(image)
