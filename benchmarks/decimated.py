@@ -5,8 +5,8 @@
 The sequences of `real_sequences.py`, with the shipped defaults; ATE in units of that of `pnp` on the whole sequence.
 Frames keep their times.
 
-Last answer (2 cores, OpenCV 5.0, JAX 0.10, float64; whole, stride2, stride3, gap5): geometric mean .661 .741 1.378
-1.201, without the temple .718 .650 .702 .703. The temple, 19 frames 7 degrees apart, gives .44 1.42 39.8 and 17.2 (86 %
+Last answer (2 cores, OpenCV 5.0, JAX 0.10, float64; whole, stride2, stride3, gap5): geometric mean .661 .756 1.382
+1.201, without the temple .718 .667 .705 .703. The temple, 19 frames 7 degrees apart, gives .44 1.42 39.8 and 17.2 (86 %
 covered): of every third frame 17 tracks are left, and 12 of them agree on a wrong motion; five less are a step of 45
 degrees.
 """
