@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxtri.checks import checked
+from jaxtri.errors import InputError
 from jaxtri.filters import projective
 from jaxtri.filters.diagnostics import Diagnostics, Robust, count_passes, unless_overflown, weigh
 from jaxtri.filters.linalg import Inverse, Prior, linearised, whiten
@@ -231,6 +232,8 @@ def update(
     linearise, support, components = _measuring(model, belief, items, mask)
     noise_scale, observed = replace_masked(mask, noise_scale, 1.0), replace_masked(mask, observed, 0.0)
     considered = getattr(model, "considered", None)
+    if begin is not None and begin.shape != P.shape[:1]:
+        raise InputError(f"begin has the shape {begin.shape}; an error of the prediction has {P.shape[:1]}")
     passes_ = _Passes(
         lambda delta: linearise(mean, delta, observed, mask, noise_scale),
         Prior.of(P, support),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jaxlie import SE3
 
+from jaxtri.errors import InputError
 from jaxtri.filters import consensus, ekf
 from jaxtri.geometry.pose import exp_pose, identity, local, multiply
 from jaxtri.models.base_pairs import BasePairs, BasePoint
@@ -79,3 +80,9 @@ def test_no_item_at_all():
     np.testing.assert_array_equal(
         consensus.begin(MODEL, PREDICTED, items, observed, jnp.zeros(N, bool), ROBUST), jnp.zeros(12)
     )
+
+
+def test_an_error_of_another_length_is_refused():
+    _, items, observed = frame(0.02, 0, 0)
+    with pytest.raises(InputError, match=r"begin has the shape \(6,\); an error of the prediction has \(12,\)"):
+        updated(items, observed, jnp.ones(N, bool), jnp.zeros(6))
