@@ -46,12 +46,12 @@ class Classic:
 
     Attributes:
         tracks: What is seen.
-        pair: The two frames of the start.
+        second: The frame that the start is made of, beside the first one.
         window: Whether the last keyframes are adjusted.
     """
 
     tracks: Tracks
-    pair: tuple[int, int]
+    second: int
     window: bool = False
     poses: np.ndarray = field(init=False)
 
@@ -60,11 +60,11 @@ class Classic:
         self.poses: np.ndarray = np.tile(np.eye(4), (t, 1, 1))
         self.X = np.full((m, 3), np.nan)
         self.first = np.argmax(np.isfinite(self.tracks.points[..., 0]), axis=0)
-        self._start(*self.pair)
-        self.keyframes = list(self.pair)
-        for k in [*range(self.pair[0] + 1, self.pair[1]), *range(self.pair[1] + 1, t)]:
+        self._start(self.second)
+        self.keyframes = [0, self.second]
+        for k in [*range(1, self.second), *range(self.second + 1, t)]:
             self._locate(k)
-            if k > self.pair[1]:
+            if k > self.second:
                 self._extend(k)
                 if self._due(k):
                     self.keyframes.append(k)
@@ -75,9 +75,9 @@ class Classic:
         """Camera to world."""
         return Trajectory(times, np.linalg.inv(self.poses))
 
-    def _start(self, a: int, b: int) -> None:
-        both = np.flatnonzero(self.tracks.seen(a) & self.tracks.seen(b))
-        one, two = self.tracks.points[a, both], self.tracks.points[b, both]
+    def _start(self, b: int) -> None:
+        both = np.flatnonzero(self.tracks.seen(0) & self.tracks.seen(b))
+        one, two = self.tracks.points[0, both], self.tracks.points[b, both]
         E, mask = cv2.findEssentialMat(one, two, np.eye(3), cv2.RANSAC, 0.9999, 1.5 / self.tracks.focal)
         _, R, T, mask, _ = cv2.recoverPose(E, one, two, np.eye(3), distanceThresh=1e6, mask=mask)
         self.poses[b, :3, :3], self.poses[b, :3, 3] = R, T[:, 0]
@@ -85,9 +85,9 @@ class Classic:
 
     def _triangulate(self, which: np.ndarray, now: int) -> None:
         """From the first look and that of now; what lies behind a camera or far from its images stays unknown."""
-        A = self.poses[np.maximum(self.first[which], self.pair[0])]
+        A = self.poses[self.first[which]]
         B = np.broadcast_to(self.poses[now], A.shape)
-        u = self.tracks.points[np.maximum(self.first[which], self.pair[0]), which]
+        u = self.tracks.points[self.first[which], which]
         v = self.tracks.points[now, which]
         rows = [x[:, i, None] * P[:, 2] - P[:, i] for x, P in ((u, A), (v, B)) for i in (0, 1)]
         X = np.linalg.svd(np.stack(rows, axis=1))[2][:, -1]
@@ -122,7 +122,7 @@ class Classic:
         new = np.flatnonzero(self.tracks.seen(k) & np.isnan(self.X[:, 0]) & (self.first < k))
         if not len(new):
             return
-        since = np.maximum(self.first[new], self.pair[0])
+        since = self.first[new]
         rays = []
         for x, R in (
             (self.tracks.points[since, new], self.poses[since, :3, :3]),
@@ -166,8 +166,8 @@ class Classic:
 def _residuals(poses, X, at, which, u, focal):
     """Huber's cost, the residuals in pixels, the points in the cameras, and the weights."""
     Y = np.einsum("nij,nj->ni", poses[at, :3, :3], X[which]) + poses[at, :3, 3]
-    z = np.where(Y[:, 2] > 1e-6, Y[:, 2], 1e-6)
-    r = (u - Y[:, :2] / z[:, None]) * focal
+    Y[:, 2] = np.maximum(Y[:, 2], 1e-6)
+    r = (u - Y[:, :2] / Y[:, 2:]) * focal
     size = np.linalg.norm(r, axis=1)
     weight = np.where(size > 1, 1 / np.maximum(size, 1), 1.0)
     return np.sum(np.where(size > 1, 2 * size - 1, size**2)), r, Y, weight
@@ -177,8 +177,7 @@ def _step(poses, X, at, which, u, focal, damping):
     """Poses and points a step further, the points eliminated."""
     _, r, Y, weight = _residuals(poses, X, at, which, u, focal)
     k, m = len(poses), len(X)
-    z = np.where(Y[:, 2] > 1e-6, Y[:, 2], 1e-6)
-    zero = np.zeros_like(z)
+    z, zero = Y[:, 2], np.zeros(len(Y))
     image = np.stack([1 / z, zero, -Y[:, 0] / z**2, zero, 1 / z, -Y[:, 1] / z**2], axis=1).reshape(-1, 2, 3) * focal
     skew = np.stack([zero, Y[:, 2], -Y[:, 1], -Y[:, 2], zero, Y[:, 0], Y[:, 1], -Y[:, 0], zero], axis=1)
     A = np.concatenate([image, image @ skew.reshape(-1, 3, 3)], axis=2)  # left perturbation (linear, angular)

@@ -16,7 +16,7 @@ from jaxtri.vision.video import Frame
 
 TILT = np.radians(13)  # the rendered world is the first camera of the laboratory, so much downwards
 FPS = 25.0
-BARE = ("bare_room", "bare_shake")
+BARE, WEAK = ("bare_room", "bare_shake"), 2.5  # clips in a bare room, and grey levels of its texture
 
 
 class Path(NamedTuple):
@@ -75,7 +75,7 @@ def jerks(n: int, seed: int) -> dict[str, Path]:
     jitter = rng.normal(size=(n, 3))
     return {
         # One frame is missing while the camera turns by 16 degrees and moves by 19 centimetres.
-        "skipped": Path(hand + _columns(8 + 0 * s, 16 * step - 8, zero), walk + step[:, None] * [0.19, 0, 0]),
+        "skipped": Path(hand + _columns(8 + zero, 16 * step - 8, zero), walk + step[:, None] * [0.19, 0, 0]),
         "stumble": Path(
             hand + _columns(8 + 6 * stumble, 2 * stumble, 4 * stumble), walk + stumble[:, None] * [0.03, 0.10, 0.03]
         ),
@@ -89,21 +89,23 @@ def jerks(n: int, seed: int) -> dict[str, Path]:
 def truth(path: Path) -> np.ndarray:
     """Camera to world (t, 4, 4) in the rendered world."""
 
-    def rotations(vectors: np.ndarray) -> np.ndarray:
-        return np.array(jax.vmap(lambda w: SE3.exp(jnp.append(jnp.zeros(3), w)).as_matrix())(jnp.asarray(vectors)))
-
-    room = rotations(np.radians(path.turns * [-1, 1, 1]))
+    room = _rotations(np.radians(path.turns * [-1, 1, 1]))
     room[:, :3, 3] = path.positions
-    return rotations(np.array([[TILT, 0, 0]])) @ room
+    return _rotations(np.array([[TILT, 0, 0]])) @ room
+
+
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    """(t, 4, 4) of rotation vectors (t, 3), radians."""
+    return np.array(jax.vmap(lambda w: SE3.exp(jnp.append(jnp.zeros(3), w)).as_matrix())(jnp.asarray(vectors)))
 
 
 def bare_room(seed: int) -> Scene:
     """Walls, a floor and a few boxes of weak texture, in the world of the laboratory."""
     rng = np.random.default_rng(seed)
 
-    def wall(corner: tuple, along: tuple, down: tuple, strength: float = 2.5) -> Quad:
+    def wall(corner: tuple, along: tuple, down: tuple) -> Quad:
         rows, columns = (int(160 * np.linalg.norm(v)) for v in (down, along))
-        return quad(corner, along, down, textures.mottled(rows, columns, (190, 196, 198), rng, strength=strength))
+        return quad(corner, along, down, textures.mottled(rows, columns, (190, 196, 198), rng, strength=WEAK))
 
     quads = [
         wall((-2.4, -1.3, 2.3), (4.8, 0, 0), (0, 2.3, 0)),
@@ -113,11 +115,9 @@ def bare_room(seed: int) -> Scene:
     ]
     for x, z, side in ((-0.7, 1.3, 0.5), (0.5, 1.6, 0.7), (1.3, 1.1, 0.4), (-1.5, 1.8, 0.6), (0.0, 1.1, 0.3)):
         tone = tuple(rng.uniform(110, 200, 3))
-        faces = [textures.mottled(60, 60, tone, rng, strength=2.5) for _ in range(6)]
+        faces = [textures.mottled(60, 60, tone, rng, strength=WEAK) for _ in range(6)]
         quads += box((x, 1.0 - side / 2, z), (side, side, side), rng.uniform(-0.5, 0.5), faces)
-    tilt = np.eye(4)
-    tilt[:3, :3] = np.asarray(SE3.exp(jnp.array([0, 0, 0, TILT, 0, 0])).as_matrix())[:3, :3]
-    return transform(Scene(tuple(quads), (90, 95, 98)), tilt)
+    return transform(Scene(tuple(quads), (90, 95, 98)), _rotations(np.array([[TILT, 0, 0]]))[0])
 
 
 def rendered(name: str, path: Path, seed: int) -> Iterator[Frame]:

@@ -46,7 +46,7 @@ def main() -> None:
         tracks, origin = Tracks.of(recording, clip), int(recording.origin)
         found = {"ours": run.odometry.trajectory(), "refined": run.trajectory}
         for kind in ("pnp", "window"):
-            plain = Classic(tracks, (0, int(recording.second[0])), window=kind == "window")
+            plain = Classic(tracks, int(recording.second[0]), window=kind == "window")
             found[kind] = plain.trajectory(np.arange(origin, origin + len(plain.poses)) / FPS)
         errors = {kind: evaluate(x, true) for kind, x in found.items()}
         status = [p.status for p in run.odometry.poses]

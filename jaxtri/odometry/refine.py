@@ -339,8 +339,10 @@ def _measured(
         items = BasePoint(X, jnp.zeros((*X.shape, 0), X.dtype))
         near = jax.tree.map(lambda x: x[index], poses)
         begin = jnp.pad(local(mean, multiply(SE3.from_matrix(carried), near)), (0, 6))
-        passes = {"passes": settings.passes, "robust": settings.robust, "begin": begin}
-        belief, said = ekf.update(model, belief, items, observed, mask, noise_scale=scale, **passes)
+        passes, robust = settings.passes, settings.robust
+        belief, said = ekf.update(
+            model, belief, items, observed, mask, passes=passes, robust=robust, noise_scale=scale, begin=begin
+        )
         pose = belief.mean.pose
         along = adjoint(relative(near, pose))
         owed = along @ covariances[index] @ along.T
