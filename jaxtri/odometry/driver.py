@@ -358,6 +358,7 @@ class Odometry(Archived):
             state, _ = fill(self._settings, [first, last], pose, world, [1.0])
             pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
         state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
+        noise = float(reports[0][1].noise)
         status = Status.RESTARTED if again else Status.TRACKING
         poses = {first.index: FramePose(first.time, status, pose_matrix(world), np.zeros((6, 6)))}
         reports = [*reports, *self._backwards(first, state, world)]
@@ -367,7 +368,7 @@ class Odometry(Archived):
         else:
             assert isinstance(self.base, Base)
             follower = SinglePair.after(self._settings, self._start, self.base, frames, pose, world)
-        pair = BasePair(first.index, last.index, first.index, searched.found.pose, searched.found.inside)
+        pair = BasePair(first.index, last.index, first.index, searched.found.pose, searched.found.inside, noise)
         return _Begun(pair, follower, poses)
 
     def _backwards(self, first: Observations, state, world: SE3) -> Iterator[tuple[Observations, Report]]:

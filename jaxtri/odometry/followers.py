@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.pose import relative
+from jaxtri.models.base_pairs import BasePoint
 from jaxtri.odometry import single_pair, track_pairs
 from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
 from jaxtri.odometry.start import BasePair, Observations, find, step_tracks
@@ -77,7 +78,7 @@ class TrackPairs:
         """The pose of the next frame."""
         fresh = frame.visible & (frame.ids != self.known)
         over = (self.known >= 0) & (fresh | ~frame.visible)
-        self.structure.end(self.state.tracks.base, over & self._good(), self.known)
+        self.structure.end(self._points(), over & self._good(), self.known)
         self.known = np.where(frame.visible, frame.ids, -1)
         self.state, report = step_tracks(
             self.settings, self.state, frame.u, frame.visible, fresh, dt, hold=np.False_, quality=frame.quality
@@ -95,7 +96,12 @@ class TrackPairs:
 
     def present(self) -> Points:
         """The points of the tracks that are followed now."""
-        return self.structure.of(self.state.tracks.base, self._good(), self.known)
+        return self.structure.of(self._points(), self._good(), self.known)
+
+    def _points(self) -> BasePoint:
+        """With their errors over the assumed noise, whatever was found since."""
+        base = self.state.tracks.base
+        return base._replace(spread=np.asarray(base.spread) * float(self.state.noise))
 
 
 @dataclass

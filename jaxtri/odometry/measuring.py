@@ -1,5 +1,6 @@
 """One frame measured, whichever base frames its tracks stand on: predict, update, and judge what came of it."""
 
+import math
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -24,6 +25,8 @@ GAUGE = 1e-6
 # Standard deviation of the velocity at a start, in scene depths and in radians per frame: at video rate it is all but
 # unknown, and the first update fixes it.
 START_VELOCITY = 0.05
+# Variance of the noise over what it was taken for, that a frame may show at most: a bad frame does not rule the next.
+SUDDEN = 10.0
 # Inverse depth (1 / scene units) from which a point counts as infinitely far: what is divided by it stays finite.
 FARTHEST = 1e-9
 
@@ -120,6 +123,21 @@ def judged(status: Int[Array, ""], covariance: Float[Array, "6 6"], said: ekf.Di
     found = doubts(said.nis, said.used, said.measured, sd)
     doubted = (status == Status.TRACKING) & (found.misfit | found.minority | found.blurred)
     return jnp.where(doubted, Status.UNCERTAIN, status).astype(jnp.int32)
+
+
+def found_noise(
+    settings: Settings, noise: Float[Array, ""], distance: Float[Array, " n"], measured: Bool[Array, " n"]
+) -> Float[Array, ""]:
+    """Noise over `settings.sigma` once a frame has shown its points; `noise` is what it was taken for.
+
+    `distance` are their squared distances in standard deviations by that. Half of them should lie below 2 log 2, the
+    median of a chi-square of two degrees of freedom, and an outlier moves that little. It is never less than 1: an
+    error that neighbours share goes into the pose, and no point shows it.
+    Source: Mehra 1970, for covariance matching; Huber 1981, section 5.1, for the median.
+    """
+    shown = median(distance, measured) / (2 * math.log(2))
+    share = jnp.clip(shown, 1 / SUDDEN, SUDDEN) ** (settings.noise_gain / 2)
+    return jnp.maximum(noise * share, 1.0)
 
 
 def median(x: Float[Array, " n"], mask: Bool[Array, " n"], without: float = 1.0) -> Float[Array, ""]:

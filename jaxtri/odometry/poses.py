@@ -30,6 +30,7 @@ class FramePose:
         nis: Normalised innovation squared of these points: 2 `used` is right. NaN where nothing was measured.
         measured: How many points were measured.
         parallax_deg: Median angle between the rays that the points used are known from; NaN where there is none.
+        noise: Standard deviation that the points were taken to have, over the one assumed.
     """
 
     time: float
@@ -40,6 +41,7 @@ class FramePose:
     nis: float = float("nan")
     measured: int = 0
     parallax_deg: float = float("nan")
+    noise: float = 1.0
 
     @classmethod
     def of(cls, time: float, report: Report) -> "FramePose":
@@ -47,7 +49,7 @@ class FramePose:
         said, status = report.diagnostics, Status(int(report.status))
         covariance = np.asarray(report.covariance, np.float64)
         counts, angle = (int(said.used), float(said.nis), int(said.measured)), math.degrees(report.parallax)
-        return cls(time, status, pose_matrix(report.pose), covariance, *counts, angle)
+        return cls(time, status, pose_matrix(report.pose), covariance, *counts, angle, float(report.noise))
 
     @property
     def rotation_sd_deg(self) -> float:

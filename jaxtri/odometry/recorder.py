@@ -62,6 +62,7 @@ class Recorder:
             jnp.stack([p.found.translation for p in pairs]),
             SO3(jnp.stack([p.found.rotation.wxyz for p in pairs])),
             jnp.asarray(np.stack([p.inside for p in pairs])),
+            jnp.asarray([p.noise for p in pairs], dtype),
             jnp.asarray(origin),
             inherit=inherit,
         )

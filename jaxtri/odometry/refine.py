@@ -82,14 +82,16 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
     for first, end in segments(odometry):
         poses[at:first] = [_in(pose, moved) for pose in poses[at:first]]
         segment = Segment.of(odometry, first, end)
-        keys = keyframes(odometry.settings, segment)
+        noise = float(np.median([p.noise for p in odometry.poses[first:end]]))
+        settings = replace(odometry.settings, sigma=odometry.settings.sigma * noise)
+        keys = keyframes(settings, segment)
         last = poses[end - 1].T_camera_world
-        found = _Adjusted.of(odometry.settings, segment, keys, progress) if len(keys) >= FEWEST else None
+        found = _Adjusted.of(settings, noise, segment, keys, progress) if len(keys) >= FEWEST else None
         if found is None:
             parts.append({"frames": [first, end - 1], "refined": False})
         else:
-            poses[first:end] = found.frames(odometry.settings, poses[first:end])
-            points.append(found.points(odometry.settings, moved))
+            poses[first:end] = found.frames(settings, poses[first:end])
+            points.append(found.points(settings, moved))
             chosen += [first + int(k) for k in keys]
             parts.append({"frames": [first, end - 1], "refined": True} | found.statistics)
         poses[first:end] = [_in(pose, moved) for pose in poses[first:end]]
@@ -134,8 +136,10 @@ class _Adjusted:
     statistics: dict[str, object]
 
     @classmethod
-    def of(cls, settings: Settings, segment: Segment, keys: np.ndarray, progress: bool) -> "_Adjusted | None":
-        """Those of a stretch; None where nothing finite came of it."""
+    def of(
+        cls, settings: Settings, over: float, segment: Segment, keys: np.ndarray, progress: bool
+    ) -> "_Adjusted | None":
+        """Those of a stretch, whose settings have a noise of `over` what was assumed; None if nothing finite came."""
         pieces = Pieces.of(segment, keys)
         dtype, k = segment.u.dtype, room(len(keys))
         centre = -np.einsum("kji,kj->ki", segment.T[keys, :3, :3], segment.T[keys, :3, 3])
@@ -171,7 +175,7 @@ class _Adjusted:
             "observations": len(pieces.key),
             "steps": len(costs),
             "converged": bool(now.converged),
-            "noise_over_assumed": float(f"{np.sqrt(inflation):.3g}"),
+            "noise_over_assumed": float(f"{over * np.sqrt(inflation):.3g}"),
         }
         inflation = max(inflation, 1.0)
         spread = pieces.each(spread, (4, 3)) * np.sqrt(inflation)

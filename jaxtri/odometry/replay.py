@@ -42,6 +42,7 @@ class Recording(eqx.Module, Archived):
         translation: (s, 3) about the relative pose of each pair, of unit length.
         rotation: (s,) the same of its rotation.
         inside: (s, n) tracks that each relative pose is estimated from.
+        noise: (s,) of the tracks at each start, over `Settings.sigma`.
         origin: Frame of the run that is frame 0 here: the first base frame.
         inherit: Restarts take frames already tracked, else consecutive ones (static).
     """
@@ -57,6 +58,7 @@ class Recording(eqx.Module, Archived):
     translation: Float[Array, "s 3"]
     rotation: SO3
     inside: Bool[Array, "s n"]
+    noise: Float[Array, " s"]
     origin: Int[Array, ""]
     inherit: bool = eqx.field(static=True, default=False)
 
@@ -73,7 +75,7 @@ class Recording(eqx.Module, Archived):
         frames = np.where(np.asarray(self.frames) < frame, np.asarray(self.frames), -1)[kept]
         length = max(int((frames >= 0).sum(axis=1).max(initial=0)), 1)
         cut = {name: getattr(self, name)[:frame] for name in ("pixels", "visible", "ids", "quality", "dt")}
-        cut |= {name: getattr(self, name)[kept] for name in ("first", "second", "translation", "inside")}
+        cut |= {name: getattr(self, name)[kept] for name in ("first", "second", "translation", "inside", "noise")}
         rotation = SO3(self.rotation.wxyz[kept])
         return replace(self, **cut, rotation=rotation, frames=jnp.asarray(frames[:, :length]))
 
@@ -92,7 +94,7 @@ def tracks(camera: Camera, settings: Settings, recording: Recording, *, block: i
     ids, visible, second = recording.ids, recording.visible, recording.second[0]
     common = visible[0] & visible[second] & (ids[0] == ids[second])
     pose = compose(view.rotation, view.translation)
-    state = track_pairs.init(settings, u[0], u[second], common, pose)
+    state = track_pairs.init(settings, u[0], u[second], common, pose, noise=recording.noise[0])
     # Up to the second base frame only the pair's tracks are measured; what else is there begins after it.
     at = jnp.arange(1, len(ids))[:, None]
     same = visible[:-1] & visible[1:] & (ids[1:] == ids[:-1])

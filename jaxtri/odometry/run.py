@@ -291,6 +291,7 @@ def _statistics(odometry: Odometry, poses: list[FramePose]) -> dict[str, object]
             "rotation_sd_deg": _figures(p.rotation_sd_deg for p in poses),
             "position_sd": _figures(p.position_sd for p in poses),
             "parallax_deg": _figures(p.parallax_deg for p in poses),
+            "noise_over_assumed": _figures(p.noise for p in poses),
         },
         "starts": odometry.starts,
         "restarts": odometry.changes,

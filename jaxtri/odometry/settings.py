@@ -111,6 +111,8 @@ class Settings(eqx.Module):
         point_noise: Noise of each point over `sigma`, from what the feature tracker says of it; None takes `sigma` for
             all. None by default: learned on five sequences it changes the error on the sixth by no more than chance
             (`benchmarks/tuning.py`).
+        noise_gain: Share by which a frame moves the noise that is found (`Base.TRACKS`): what the points are taken to
+            have is `sigma` or, where they show more, that. 0 keeps `sigma`. 1 believes each frame by itself.
         passes: Linearisations of an update (static). Eight bring the weights of `robust` from their start to their end.
         refinements: Steps by which the window of keyframes is improved when one is made (static). A keyframe begins
             nearly right, and those before it have been improved already.
@@ -132,6 +134,7 @@ class Settings(eqx.Module):
     patience: Float[Array, ""] = eqx.field(converter=number)
     robust: ekf.Robust
     point_noise: PointNoise | None = None
+    noise_gain: Float[Array, ""] = eqx.field(default=0.2, converter=number)
     passes: int = eqx.field(static=True, default=8)
     refinements: int = eqx.field(static=True, default=1)
 
@@ -163,6 +166,7 @@ class Settings(eqx.Module):
 
         return cls(
             sigma=noise_px / focal,
+            noise_gain=scalar(0.2),
             correlation=scalar(0.9),
             calibration=scalar(calibration),
             acceleration=scalar(0.2),
@@ -236,6 +240,7 @@ class Report(NamedTuple):
         parallax: Median angle in radians between the rays that the points used are known from.
         drop: (n,) tracks that are outliers: their slots may be filled anew.
         diagnostics: What the update found; see `jaxtri.Diagnostics`.
+        noise: Standard deviation that the points were taken to have, over `Settings.sigma`.
     """
 
     pose: SE3
@@ -245,3 +250,4 @@ class Report(NamedTuple):
     parallax: Float[Array, ""]
     drop: Bool[Array, " n"]
     diagnostics: ekf.Diagnostics
+    noise: Float[Array, ""]

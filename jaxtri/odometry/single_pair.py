@@ -154,7 +154,8 @@ def step(
     structure = structure_model(settings).step(state.structure, pose, observed, inside & ok, own_covariance(new), dt)
     new = new._replace(structure=structure)
     status = judged(found.status, covariance, found.diagnostics)
-    return new, Report(pose, covariance, status, jnp.asarray(False), _parallax(new), drop, found.diagnostics)
+    one = jnp.ones((), observed.dtype)
+    return new, Report(pose, covariance, status, jnp.asarray(False), _parallax(new), drop, found.diagnostics, one)
 
 
 def _parallax(state: State) -> Float[Array, ""]:
@@ -285,4 +286,5 @@ def second_report(state: State) -> Report:
     unknown, count = jnp.full((), jnp.nan, nothing.dtype), jnp.sum(inside)
     diagnostics = ekf.Diagnostics(unknown, unknown, count, count, inside.astype(nothing.dtype), nothing)
     status = jnp.asarray(int(Status.TRACKING))
-    return Report(*world_pose(state), status, jnp.asarray(True), _parallax(state), jnp.zeros_like(inside), diagnostics)
+    keyframe, angle, drop = jnp.asarray(True), _parallax(state), jnp.zeros_like(inside)
+    return Report(*world_pose(state), status, keyframe, angle, drop, diagnostics, jnp.ones_like(angle))

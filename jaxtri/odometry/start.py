@@ -71,6 +71,7 @@ class BasePair(NamedTuple):
         last: Number of the last frame that the pair before it measured.
         found: The relative pose of the two.
         inside: (n,) tracks that agree with it.
+        noise: Standard deviation of the tracks over the assumed one, as the frames between the two have shown it.
     """
 
     first: int
@@ -78,6 +79,7 @@ class BasePair(NamedTuple):
     last: int
     found: TwoView
     inside: np.ndarray
+    noise: float = 1.0
 
 
 def find(settings: Settings, start: StartSettings, frames: list[Observations]) -> Start:
@@ -140,12 +142,16 @@ def fill(
     common = first.common(last)
     pose = compose(two_view.rotation, two_view.translation)
     arrays = jnp.asarray(first.u), jnp.asarray(last.u), jnp.asarray(common)
-    state = init_tracks(settings, *arrays, pose, world=world)
-    reports = []
-    for frame, elapsed in zip(frames[1:], dt, strict=True):
-        state, report = hold(settings, state, frame, first.common(frame) & common, elapsed)
-        reports.append((frame, report))
-    return state, reports
+
+    def over(noise: float) -> tuple[track_pairs.State, list[tuple[Observations, Report]]]:
+        state, reports = init_tracks(settings, *arrays, pose, world=world, noise=noise), []
+        for frame, elapsed in zip(frames[1:], dt, strict=True):
+            state, report = hold(settings, state, frame, first.common(frame) & common, elapsed)
+            reports.append((frame, report))
+        return state, reports
+
+    # Twice: the points of the pair, too, have the noise that the frames between show.
+    return over(max(float(report.noise) for _, report in over(1.0)[1]))
 
 
 def hold(

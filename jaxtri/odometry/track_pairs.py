@@ -6,6 +6,7 @@ mask. A keyframe is a frame whose pose is kept, and improved with those before i
 segments: overlapping tracks carry the scale.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from jaxtri.geometry.pose import identity, multiply
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.motion import Twist
 from jaxtri.odometry.keyframes import carry, total
-from jaxtri.odometry.measuring import FARTHEST, GAUGE, START_VELOCITY, judged, measure, median, noise_scale
+from jaxtri.odometry.measuring import FARTHEST, GAUGE, START_VELOCITY, found_noise, judged, measure, median, noise_scale
 from jaxtri.odometry.settings import Report, Settings
 from jaxtri.odometry.window import Refined, Window, add, start
 
@@ -68,6 +69,7 @@ class State(NamedTuple):
         held: (n,) tracks that have not broken since the last keyframe.
         depth: Median depth of the scene, scene units.
         coasted: Frames since the last update that was taken.
+        noise: Standard deviation of a tracked point over `Settings.sigma`, as the frames so far have shown it.
     """
 
     belief: ekf.Belief[Twist]
@@ -79,6 +81,17 @@ class State(NamedTuple):
     held: Bool[Array, " n"]
     depth: Float[Array, ""]
     coasted: Int[Array, ""]
+    noise: Float[Array, ""]
+
+
+def _louder(settings: Settings, noise: Float[Array, ""]) -> Settings:
+    """The settings with the noise that was found in the place of the one assumed.
+
+    The robust weights stay as narrow as they are, in pixels: what is noisy is often a few blurred frames, and wider
+    weights let in more that is wrong than they gain.
+    """
+    robust = replace(settings.robust, scale=settings.robust.scale / noise**2)
+    return replace(settings, sigma=settings.sigma * noise, robust=robust)
 
 
 def _model(settings: Settings, depth: Float[Array, ""]) -> BasePairs:
@@ -95,13 +108,15 @@ def init(
     *,
     world: SE3 | None = None,
     keyframes: int = 16,
+    noise: Float[Array, ""] | float = 1.0,
 ) -> State:
     """The state at the first of two base frames whose relative pose X2 = pose X1 is known.
 
     `first` and `second` are normalised image points in slots, `mask` marks the slots seen in both. The length of the
     base line is the unit of length; the rest of `pose` is estimated anew from the points. `world` is the pose of the
-    first frame (the identity by default). `keyframes` is how many of them are kept, at least 4. Give the frames between
-    the two, and the second, to `step` with `hold=True`.
+    first frame (the identity by default). `keyframes` is how many of them are kept, at least 4. `noise` is the standard
+    deviation of the points over `settings.sigma`, where it is known. Give the frames between the two, and the second,
+    to `step` with `hold=True`.
     """
     if keyframes < FEWEST:
         raise InputError(f"keyframes is {keyframes}; keep at least {FEWEST}")
@@ -113,7 +128,8 @@ def init(
     inverse, good = jax.vmap(lambda a, b: _agreeing(settings, a, b, pose))(first, second)
     good &= mask
     depth = median(1 / jnp.where(good, inverse, 1.0), good)
-    window, refined = start(settings, first, second, good, one, two, depth, keyframes)
+    noise = jnp.asarray(noise, dtype)
+    window, refined = start(_louder(settings, noise), first, second, good, one, two, depth, keyframes)
     # What the two frames did not agree on may still agree with later ones.
     window = window._replace(mask=window.mask.at[-2:].set(mask))
     belief = ekf.Belief(Twist(one, jnp.zeros(6, dtype)), _known(depth, jnp.asarray(START_VELOCITY, dtype)))
@@ -128,6 +144,7 @@ def init(
         mask,
         depth,
         jnp.asarray(0, jnp.int32),
+        noise,
     )
 
 
@@ -190,12 +207,14 @@ def step(
     keep = visible & ~fresh
     tracks = _only(state.tracks, keep)
 
+    assumed, settings = settings, _louder(settings, state.noise)
     model, dt = _model(settings, state.depth), jnp.asarray(dt, observed.dtype)
     mask, scale = tracks.usable, noise_scale(settings, quality)
     items = projective.prepare(model, stand_in(mask, tracks.base))
     found = measure(settings, model, state.belief, items, observed, mask, dt, state.coasted, scale)
     belief, ok, drop = found.belief, found.taken, found.drop
     weights = jnp.where(ok, found.diagnostics.weights, 0.0)
+    noise = jnp.where(ok, found_noise(assumed, state.noise, found.diagnostics.distance, mask), state.noise)
     sensitivity = carry(
         state.sensitivity,
         transition(model, state.belief.mean, dt),
@@ -219,13 +238,19 @@ def step(
     depths = depths / jnp.where(jnp.abs(inverse) > FARTHEST, inverse, FARTHEST) + belief.mean.pose.translation()[2]
     depth = jnp.where(ok & (usable > 0), median(depths, tracks.usable & (depths > 0)), state.depth)
     plain = state._replace(
-        belief=belief, tracks=tracks, sensitivity=sensitivity, held=held, depth=depth, coasted=found.coasted
+        belief=belief,
+        tracks=tracks,
+        sensitivity=sensitivity,
+        held=held,
+        depth=depth,
+        coasted=found.coasted,
+        noise=noise,
     )
     new = jax.lax.cond(keyframe, lambda: _rebase(settings, plain, observed, visible), lambda: plain)
     covariance = total(new.belief.covariance[:6, :6], new.covariance, new.sensitivity)
     status, said = judged(found.status, covariance, found.diagnostics), found.diagnostics
     parallax = median(tracks.angle, tracks.usable, jnp.nan)
-    return new, Report(new.belief.mean.pose, covariance, status, keyframe, parallax, drop, said)
+    return new, Report(new.belief.mean.pose, covariance, status, keyframe, parallax, drop, said, state.noise)
 
 
 def _owed(

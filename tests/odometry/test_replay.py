@@ -117,7 +117,9 @@ def test_likelihoods_are_those_of_pixels():
     )
     pose = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, *x.shape)), SE3.identity())
     none = jnp.zeros(2, bool)
-    report = Report(pose, jnp.zeros((2, 6, 6)), jnp.ones(2, int), none, jnp.zeros(2), jnp.zeros((2, 5), bool), said)
+    report = Report(
+        pose, jnp.zeros((2, 6, 6)), jnp.ones(2, int), none, jnp.zeros(2), jnp.zeros((2, 5), bool), said, jnp.ones(2)
+    )
     jacobians = jax.vmap(jax.vmap(jax.jacrev(camera.to_normalised)))(pixels[1:])
     log_det = np.log(np.abs(np.linalg.det(jacobians)))[np.asarray(weights) > 0].sum()
     expected = -(70 + log_det - np.log(640 * 480)) / 18

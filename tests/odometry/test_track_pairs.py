@@ -78,6 +78,15 @@ def position_errors(scene, reports):
     return np.linalg.norm(centres - scene.centres[1:], axis=-1)
 
 
+def squares(scene, reports):
+    """NEES of the poses."""
+    poses = jax.vmap(lambda R, T: compose(SO3.from_matrix(R), T))(jnp.asarray(scene.R), jnp.asarray(scene.T))
+    errors = jax.vmap(lambda a, b: log_pose(relative(a, b)))(
+        SE3(jnp.asarray(reports.pose.wxyz_xyz)), jax.tree.map(lambda x: x[1:], poses)
+    )
+    return np.einsum("ti,ti->t", errors, np.linalg.solve(reports.covariance, errors[..., None])[..., 0])
+
+
 @pytest.fixture(scope="module")
 def exact():
     scene = Scene()
@@ -105,15 +114,32 @@ def test_exact_tracks_give_exact_poses_through_births_and_deaths(exact):
 
 def test_errors_are_those_that_the_covariance_says(noisy):
     scene, _, reports = noisy
-    poses = jax.vmap(lambda R, T: compose(SO3.from_matrix(R), T))(jnp.asarray(scene.R), jnp.asarray(scene.T))
-    errors = jax.vmap(lambda a, b: log_pose(relative(a, b)))(
-        SE3(jnp.asarray(reports.pose.wxyz_xyz)), jax.tree.map(lambda x: x[1:], poses)
-    )
-    nees = np.einsum("ti,ti->t", errors, np.linalg.solve(reports.covariance, errors[..., None])[..., 0])
+    nees = squares(scene, reports)
     assert position_errors(scene, reports).max() < 0.03
     # One run, whose frames share the errors of the first keyframes: no more than one independent frame.
     low, high = nees_interval(6, 1)
     assert low < np.mean(nees[SECOND:]) < high
+
+
+def test_noise_above_the_assumed_one_is_found_and_stated():
+    found, nees = [], []
+    for seed in range(6):
+        scene = Scene(noise_px=1.2, seed=seed)  # three times what is assumed
+        _, reports = follow(scene)
+        found.append(reports.noise[-1])
+        nees.append(squares(scene, reports)[-1])
+    np.testing.assert_allclose(np.mean(found), 3.0, rtol=0.1)
+    low, high = nees_interval(6, 6)
+    assert low < np.mean(nees) < high
+
+
+def test_noise_below_the_assumed_one_changes_nothing():
+    scene = Scene(noise_px=0.2)
+    _, reports = follow(scene)
+    _, fixed = follow(scene, settings=eqx.tree_at(lambda s: s.noise_gain, SETTINGS, jnp.asarray(0.0)))
+    np.testing.assert_array_equal(reports.noise, 1.0)
+    for a, b in zip(jax.tree.leaves(reports), jax.tree.leaves(fixed), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_what_stands_in_an_invisible_slot_changes_nothing(noisy):
