@@ -39,7 +39,8 @@ from jaxtri.filters import ekf, schmidt
 from jaxtri.filters.ekf import Belief, Diagnostics, Robust
 from jaxtri.filters.scan import batch
 from jaxtri.formats.archive import load, save
-from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady, DoubleSphere, ExtendedUnified, FieldOfView, Fisheye
 from jaxtri.models.base_frames import BaseFrames, BaseFramesState
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.baselines.structure_and_motion import StructureAndMotion
@@ -55,7 +56,7 @@ from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relat
 
 if TYPE_CHECKING:
     from jaxtri.estimation import tuning
-    from jaxtri.formats import read_camera, read_timestamps, read_trajectory, write_tum
+    from jaxtri.formats import read_camera, read_timestamps, read_trajectory, write_camera, write_tum
     from jaxtri.odometry.driver import Odometry
     from jaxtri.odometry.poses import FramePose
     from jaxtri.odometry.refine import Refinement, refine
@@ -85,6 +86,7 @@ _LATER = {
     "track": "jaxtri.odometry.run",
     "tuning": "jaxtri.estimation",
     "warm_up": "jaxtri.odometry.run",
+    "write_camera": "jaxtri.formats",
     "write_overlay": "jaxtri.output.results",
     "write_results": "jaxtri.output.results",
     "write_tum": "jaxtri.formats",
@@ -118,6 +120,9 @@ __all__ = [
     "CameraError",
     "Depth",
     "Diagnostics",
+    "DoubleSphere",
+    "ExtendedUnified",
+    "FieldOfView",
     "Fisheye",
     "FramePose",
     "InitialisationError",
@@ -177,6 +182,7 @@ __all__ = [
     "tuning",
     "two_view",
     "warm_up",
+    "write_camera",
     "write_overlay",
     "write_results",
     "write_tum",

@@ -25,7 +25,9 @@ class Track:
     source: tyro.conf.Positional[str]
     """A video file, a folder of frames, or the number of a camera."""
     camera: Path | None = None
-    """Calibration: camera.json, or OpenCV's or ROS's YAML."""
+    """Calibration: camera.json, or the file of OpenCV, ROS, Kalibr, COLMAP, ...; FILE#NAME of several cameras."""
+    scale_camera: bool = False
+    """Scale the calibration to the size of the frames, where those were resized as a whole and not cropped."""
     fov: float | None = None
     """Horizontal field of view in degrees, where there is no calibration."""
     out: Path = Path("out")
@@ -189,7 +191,7 @@ def _camera(options: Track, size: tuple[int, int]) -> "Camera":
     from jaxtri.geometry.camera import Camera
 
     if options.camera is not None and options.fov is None:
-        return read_camera(options.camera, width=size[0], height=size[1])
+        return read_camera(options.camera, width=size[0], height=size[1], scale=options.scale_camera)
     if options.camera is not None or options.fov is None:
         raise CameraError("give the intrinsics: --camera FILE, or a guess of the field of view by --fov DEGREES")
     return Camera.from_fov(options.fov, *size)

@@ -131,7 +131,7 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
             sequence, "--camera", tmp_path / "bad.json"
         )
     (tmp_path / "words.yaml").write_text("a calibration\nof: [another, kind\n")
-    assert "neither a JSON object" in track(sequence, "--camera", tmp_path / "words.yaml")
+    assert "parsed as YAML" in track(sequence, "--camera", tmp_path / "words.yaml")
     file = tmp_path / "file"
     file.touch()
     assert "--out" in fails(["track", sequence, "--camera", camera, "--out", file, "--quiet"], capsys)

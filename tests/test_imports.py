@@ -23,7 +23,7 @@ FLOORS = (
     ("cli",),
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-CV2 = ("vision/", "output/overlay.py", "formats/cameras.py", "synthetic/rendered.py")
+CV2 = ("vision/", "output/overlay.py", "synthetic/rendered.py")
 
 
 def imports(path: Path) -> set[str]:
@@ -69,7 +69,7 @@ def test_the_core_loads_without_opencv_or_matplotlib():
     core = ("jaxtri", "jaxtri.filters.ekf", "jaxtri.models.trifocal", "jaxtri.formats", "jaxtri.synthetic")
     code = (
         f"import sys, {', '.join(core)}\n"
-        "print(sorted({'cv2', 'matplotlib', 'tqdm', 'tyro', 'scipy.spatial'} & set(sys.modules)))\n"
+        "print(sorted({'cv2', 'matplotlib', 'tqdm', 'tyro', 'scipy.spatial', 'yaml'} & set(sys.modules)))\n"
         "import jax; print(jax.config.jax_enable_x64)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,124 +1,138 @@
-"""Calibration files: camera.json, OpenCV's YAML, XML and JSON, ROS's camera_info."""
+"""Calibration files in and out: a camera of the images' size, whose numbers can be."""
 
-import json
-import math
-import re
-from collections.abc import Mapping
-from typing import Any
+import os
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from jaxtri.errors import CameraError
-from jaxtri.formats.files import PathLike, read_text
-from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
+from jaxtri.formats.calibrations import Cameras, cameras
+from jaxtri.formats.entries import Entries
+from jaxtri.formats.files import PathLike, read_text, write_json
+from jaxtri.formats.intrinsics import WORDS, Intrinsics, Size, check_unused
+from jaxtri.formats.parsing import parse
+from jaxtri.geometry.camera import Camera, same_aspect
+from jaxtri.geometry.lenses import BrownConrady
 
-NEITHER = "neither a JSON object nor OpenCV or ROS calibration YAML or XML"
+# Least focal length as a share of the larger side: 157 degrees for a straight line to stay one, and less than any
+# fisheye that sees all around it.
+_LEAST, _LEAST_WIDE = 0.1, 0.05
+_UNLIKE = 3  # fx over fy: a field of an anamorphic video has 2.9
 
-_BROWN = ("plumb_bob", "radtan", "opencv_radtan", "radial-tangential", "rational_polynomial", "brown_conrady")
-_FISHEYE = ("fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "equidistant")
-_PINHOLE = ("pinhole", "opencv", "none")
 
+def read_camera(path: PathLike, *, width: int | None = None, height: int | None = None, scale: bool = False) -> Camera:
+    """Read a camera from the calibration file of most tools, known by what it holds and not by its name.
 
-def read_camera(path: PathLike, *, width: int | None = None, height: int | None = None) -> Camera:
-    """Read a camera from JSON, OpenCV's calibration YAML, XML or JSON, or ROS camera_info YAML.
+    camera.json (fx, fy, cx, cy and, if any, skew, width, height, model, distortion); OpenCV's YAML, XML and JSON;
+    ROS's camera_info, as a file or as printed; Kalibr; EuRoC's sensor.yaml; ORB-SLAM 2 and 3; COLMAP's cameras.txt;
+    KITTI, odometry and raw; TUM-mono and DSO; one line `fx fy cx cy [k1 k2 p1 p2 [k3]]`; transforms.json of nerfstudio
+    and instant-ngp; Basalt; RealSense; Open3D; CamOdoCal and VINS.
 
-    JSON: fx, fy, cx, cy and, if any, skew, width, height, distortion, model, distortion_model. Others:
-    camera_matrix, distortion_coefficients, image_width, image_height, distortion_model. Coefficients that
-    are all zero are no distortion, unless the model is a fisheye. `width` and `height` are for files without
-    them. Raises `CameraError` naming the file and the key.
+    `width` and `height` are those of the images. Where the file has another size, `scale=True` scales the camera to
+    images that were resized as a whole. Of several cameras that differ, `FILE#NAME` takes one. Coefficients that are
+    all zero are no distortion, unless the lens is a fisheye. Raises `CameraError` naming the file and the entry: for
+    what is missing or cannot be, and for what looks like an intrinsic and is not understood.
     """
+    file, name = _split(path)
+    text = read_text(file, CameraError)
     try:
-        return _camera(_entries(read_text(path, CameraError)), width, height)
+        source = parse(text)
+        found = _chosen(cameras(source, (width, height)), name, (width, height))
+        if isinstance(source, Entries):
+            check_unused(source)
+        return _of_size(found, width, height, scale)
     except CameraError as error:
-        raise CameraError(f"{path}: {error}") from error
+        raise CameraError(f"{file}: {error}") from error
 
 
-def _camera(entries: Mapping[str, Any], width: int | None, height: int | None) -> Camera:
-    def number(key, default=None):
-        value = entries.get(key, default)
-        if value is None:
-            raise CameraError(f"{key} is missing; add it, in pixels (or camera_matrix, 3x3)")
-        return _numbers(key, value, 1)[0]
-
-    matrix = entries.get("cameramatrix", entries.get("k"))
-    if matrix is not None:
-        fx, skew, cx, _, fy, cy, *_ = _numbers("camera_matrix", matrix, 9)
-    else:
-        fx, fy, cx, cy, skew = (*map(number, ("fx", "fy", "cx", "cy")), number("skew", 0.0))
-
-    # The first word: what follows in brackets is a remark.
-    words = [re.findall(r"[\w-]+", str(entries.get(key, "none"))) for key in ("model", "distortionmodel")]
-    models = [word[0].lower() if word else "none" for word in words]
-    known = (*_PINHOLE, *_BROWN, *_FISHEYE)
-    for model in models:
-        if model not in known:
-            raise CameraError(f"model {model!r} is unknown; known are {', '.join(known)}")
-    key = next((k for k in ("distortion", "distortioncoefficients", "distcoeffs", "d") if k in entries), None)
-    coefficients = [] if key is None else _numbers(key, entries[key])
-    if not all(map(math.isfinite, coefficients)):
-        raise CameraError(f"{key} is {coefficients}; its coefficients must be finite")
-    distortion = None
-    if any(model in _FISHEYE for model in models):
-        distortion = Fisheye.from_coefficients(coefficients)
-    elif any(coefficients):
-        distortion = BrownConrady.from_coefficients(coefficients)
-
-    size = {"width": width, "height": height}
-    for name, given in size.items():
-        value = entries.get(name, entries.get("image" + name))
-        if value is not None:
-            stored = number(name if name in entries else "image" + name)
-            if not (stored > 0 and stored % 1 == 0):
-                raise CameraError(f"{name} is {stored}; it must be a positive whole number of pixels")
-            if given not in (None, stored):
-                raise CameraError(
-                    f"{name} is {stored:g}, but {given} was asked for; calibrate for that size or "
-                    "multiply fx, fy, cx, cy by the ratio"
-                )
-            size[name] = int(stored)
-    return Camera.from_parameters(fx, fy, cx, cy, skew=skew, distortion=distortion, **size)
+def write_camera(path: PathLike, camera: Camera) -> None:
+    """Write camera.json, from which `read_camera` makes the same camera."""
+    lens = camera.distortion
+    entries = {
+        "model": "pinhole" if lens is None else WORDS[type(lens)][0],
+        **{name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "skew")},
+        "width": camera.width,
+        "height": camera.height,
+        "distortion": [0.0] * 5 if lens is None else np.asarray(lens.coefficients, np.float64),
+    }
+    write_json(path, {name: value for name, value in entries.items() if value is not None})
 
 
-def _entries(text: str) -> dict[str, Any]:
-    """The top-level entries, keys in lower case without underscores."""
-    try:
-        entries = json.loads(text) if text.lstrip().startswith("{") else _opencv_entries(text)
-    except ValueError as error:
-        raise CameraError(f"cannot be parsed: {error}") from error
-    return {key.lower().replace("_", ""): value for key, value in entries.items()}
+def _split(path: PathLike) -> tuple[PathLike, str]:
+    file, _, name = os.fspath(path).rpartition("#")
+    return (file, name) if file and not Path(path).exists() else (path, "")
 
 
-def _opencv_entries(text: str) -> dict[str, Any]:
-    import cv2  # here only, since nothing else needs its YAML parser
-
-    if not text.lstrip().startswith(("%YAML", "<?xml")):
-        # ROS leaves out the head that OpenCV insists on.
-        text = "%YAML:1.0\n" + ("" if text.lstrip().startswith("---") else "---\n") + text
-
-    def value(node):
-        if node.isMap():
-            return {key: value(node.getNode(key)) for key in node.keys()}  # noqa: SIM118 (not a dict)
-        if node.isSeq():
-            return [value(node.at(i)) for i in range(node.size())]
-        return node.string() if node.isString() else node.real() if node.isReal() or node.isInt() else None
-
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        entries = value(storage.root())
-    except (cv2.error, SystemError) as error:
-        raise ValueError(NEITHER) from error
-    if not isinstance(entries, dict):
-        raise ValueError(NEITHER)
-    return entries
+def _chosen(found: Cameras, name: str, size: Size) -> Intrinsics:
+    """The camera of that name; without one the only one, or the only one of this size."""
+    if name:
+        if name not in found:
+            raise CameraError(f"has no camera {name}; there are {', '.join(found) or 'none'}")
+        return found[name]()
+    read = {key: make() for key, make in found.items()}
+    fitting = {key: c for key, c in read.items() if (c.width, c.height) == size} or read
+    if len(set(fitting.values())) > 1:
+        names = list(fitting)
+        some = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+        raise CameraError(f"holds {len(names)} cameras that differ, {some}: choose one, as FILE#{names[0]}")
+    return next(iter(fitting.values()))
 
 
-def _numbers(key: str, value: Any, count: int | None = None) -> list[float]:
-    if isinstance(value, Mapping):
-        value = value.get("data")
-    try:
-        numbers = np.asarray(value, np.float64).ravel().tolist()
-    except (TypeError, ValueError):
-        numbers = None
-    if numbers is None or value is None or (count is not None and len(numbers) != count):
-        raise CameraError(f"{key} is {value!r}; expected {count or 'a list of'} number{'s' * (count != 1)}")
-    return numbers
+def _of_size(found: Intrinsics, width: int | None, height: int | None, scale: bool) -> Camera:
+    """The camera at the size of the images, after a look at its numbers at its own."""
+    of_file = replace(found, width=found.width or width, height=found.height or height)
+    camera = of_file.camera()
+    if scale and None in (found.width, found.height):
+        raise CameraError(
+            "the size that it was calibrated at is not said, so it cannot be scaled; add width and height"
+        )
+    _check(of_file)
+    w, h = of_file.width, of_file.height
+    u, v = width or w, height or h
+    if w is None or h is None or u is None or v is None or (w, h) == (u, v):
+        return camera
+    seen = f"it was calibrated at {w}x{h}, but the images are {u}x{v}"
+    if same_aspect((w, h), (u, v)):
+        if scale:
+            return camera.scaled(u, v)
+        raise CameraError(
+            f"{seen}: if they were resized, and not cropped, scale the camera by --scale-camera, or "
+            "read_camera(..., scale=True)"
+        )
+    if same_aspect((w, h), (v, u)):
+        raise CameraError(
+            f"{seen}: it is of the picture turned by 90 degrees, and the file does not say to which side; "
+            "calibrate with images as upright as these"
+        )
+    raise CameraError(f"{seen}, of another aspect: they are cropped or stretched; calibrate for {u}x{v}")
+
+
+def _check(c: Intrinsics) -> None:
+    """Raise `CameraError` for numbers that no camera of such images has, with the likely cause."""
+    w, h = c.width or 0, c.height or 0
+    side = max(w, h) or 2 * max(abs(c.cx), abs(c.cy))
+    least = _LEAST if c.lens in (None, BrownConrady) else _LEAST_WIDE
+    small = min(c.fx, c.fy) < least * side
+    if small or max(c.fx, c.fy) < 10:
+        seen = f"fx is {c.fx:g} and fy {c.fy:g}" + (f", the image {w}x{h}" if w and h else "")
+        if max(abs(c.cx), abs(c.cy)) <= 2:
+            raise CameraError(
+                f"{seen}: are they normalised by its size? multiply fx and cx by the width, fy and cy by the height"
+            )
+        raise CameraError(
+            f"{seen}: focal lengths are in pixels; of millimetres, multiply by the width of the image in pixels and "
+            "divide by that of the sensor in millimetres"
+        )
+    if not 1 / _UNLIKE < c.fx / c.fy < _UNLIKE:
+        raise CameraError(f"fx is {c.fx:g}, but fy {c.fy:g}: no pixels are so oblong; is one mistyped?")
+    outside = [n for n, x, s in (("cx", c.cx, w), ("cy", c.cy, h)) if s and not -0.5 <= x <= s - 0.5]
+    if outside:
+        raise CameraError(
+            f"{outside[0]} is {getattr(c, outside[0]):g}: the principal point ({c.cx:g}, {c.cy:g}) lies outside the "
+            f"image of {w}x{h}; is it a calibration of another size?"
+        )
+    if w and h and c.cx == 0 == c.cy:
+        raise CameraError(
+            "cx and cy are 0: the principal point is counted from the corner of the image, not its middle"
+        )

@@ -299,7 +299,7 @@ class Odometry(Archived):
             self.reason = f"only {int(now.visible.sum())} features in frame {now.index}, and fewer last"
             return
         first, common = self._waiting[0], self._waiting[0].common(now)
-        width = (self.camera.width or 0) / float(jnp.sqrt(self.camera.fx * self.camera.fy))
+        width = (self.camera.width or 0) / float(self.camera.focal)
         flow = float(np.median(np.linalg.norm(now.u[common] - first.u[common], axis=1))) / width
         if flow < self._start.flow:
             self.reason = f"the median flow is {flow:.1%} of the image width, {self._start.flow:.1%} needed"

@@ -260,7 +260,7 @@ def _same_size(camera: Camera, frame: Frame) -> None:
     if camera.width is not None and camera.height is not None and (camera.width, camera.height) != (w, h):
         raise CameraError(
             f"the camera was calibrated at {camera.width}x{camera.height}, the frames are {w}x{h}: give the "
-            "calibration of this size, or resize the frames"
+            "calibration of this size, or, where they were resized and not cropped, camera.scaled(width, height)"
         )
 
 

@@ -157,7 +157,7 @@ class Settings(eqx.Module):
             raise InputError(f"calibration is {given}; give a share of the focal length, 0 for an exact camera")
         if passes < 1:
             raise InputError(f"passes is {passes}; give at least 1")
-        focal = jnp.sqrt(camera.fx * camera.fy)
+        focal = camera.focal
         width = jnp.asarray(camera.width if camera.width else 2 * camera.cx)
 
         def scalar(x: Float[Array, ""] | float) -> Array:

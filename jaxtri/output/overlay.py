@@ -218,7 +218,7 @@ def place(
     x = R[:, 0] - (R[:, 0] @ plane.normal) * plane.normal
     x /= np.linalg.norm(x)
     x = np.cos(HEADING) * x + np.sin(HEADING) * np.cross(plane.normal, x)
-    scale = size * w / float(camera.fx) * distance
+    scale = size * w / float(camera.fx * camera.magnification) * distance
     T = np.eye(4)
     T[:3, :3] = scale * np.stack([x, np.cross(plane.normal, x), plane.normal], axis=1)
     T[:3, 3] = spot

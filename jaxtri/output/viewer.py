@@ -24,7 +24,8 @@ def write_recording(run: Run, camera: Camera, path: Path) -> Path:
         recording.log("world/path", rr.LineStrips3D([positions]), static=True)
         recording.log("world/points", rr.Points3D(run.points.xyz, colors=run.colours), static=True)
         size = camera.width or 2 * int(camera.cx), camera.height or 2 * int(camera.cy)
-        pinhole = rr.Pinhole(image_from_camera=np.asarray(camera.K), resolution=size)
+        enlarged = np.asarray(camera.K) * np.append(np.full(2, camera.magnification), 1)  # viewers know no lenses
+        pinhole = rr.Pinhole(image_from_camera=enlarged, resolution=size)
         recording.log("world/camera", pinhole, static=True)
         for k, T in enumerate(run.trajectory.T_world_camera):
             recording.set_time("frame", sequence=k)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from jaxtri.formats import atomic_path, write_json, write_tum
+from jaxtri.formats import atomic_path, write_camera, write_tum
 from jaxtri.geometry.camera import Camera
 from jaxtri.synthetic.laboratory import Footage, laboratory
 from jaxtri.synthetic.scene import rendered_sequence
@@ -33,9 +33,5 @@ def write_footage(folder: Path, footage: Footage, seed: int = 0, *, progress: bo
     write_tum(
         folder / "groundtruth.txt", Trajectory(np.asarray(times, np.float64), np.asarray(T_world_camera, np.float64))
     )
-    intrinsics = {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
-    write_json(
-        folder / "camera.json",
-        {"model": "pinhole", **intrinsics, "width": camera.width, "height": camera.height, "distortion": [0.0] * 5},
-    )
+    write_camera(folder / "camera.json", camera)
     return camera

@@ -132,7 +132,7 @@ def render(
     x, y = np.moveaxis(pixel_rays(camera) if rays is None else rays, -1, 0)
     T = np.asarray(T_camera_world, np.float64)
     faces = [face for q in scene.quads if (face := _Face.seen(q, T)) is not None]
-    pixel = (1 / float(camera.fx), 1 / float(camera.fy))
+    pixel = (1 / float(camera.fx * camera.magnification), 1 / float(camera.fy * camera.magnification))
     owner, inverse_depth = _trace(faces, x, y)
     colours = _shade(faces, scene.background, owner, x, y, pixel)
 

@@ -14,7 +14,8 @@ from jaxlie import SE3
 
 from jaxtri import Belief, Kinematics, Robust, Settings, Twist, load, save
 from jaxtri.errors import InputError
-from jaxtri.geometry.camera import BrownConrady, Camera
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady
 from jaxtri.odometry.settings import Base, Status
 
 

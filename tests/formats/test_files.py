@@ -1,7 +1,6 @@
 import json
 import math
 import struct
-from pathlib import Path
 
 import cv2
 import jax.numpy as jnp
@@ -10,45 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxtri import formats
-from jaxtri.errors import CameraError, InputError, TrajectoryError
-from jaxtri.geometry.camera import BrownConrady, Fisheye
+from jaxtri.errors import InputError, TrajectoryError
 from jaxtri.trajectory import Trajectory
-
-GOOD = {"fx": 500.0, "fy": 510.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
-ROS = """\
-image_width: 640
-image_height: 480
-camera_name: narrow_stereo/left
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
-distortion_model: {model}
-distortion_coefficients:
-  rows: 1
-  cols: {n}
-  data: {values}
-rectification_matrix:
-  rows: 3
-  cols: 3
-  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
-"""
 
 
 def write(path, content):
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
-
-
-def values(camera):
-    return [
-        float(camera.fx),
-        float(camera.fy),
-        float(camera.cx),
-        float(camera.cy),
-        camera.width,
-        camera.height,
-    ]
 
 
 def a_trajectory(t=20):
@@ -58,110 +25,6 @@ def a_trajectory(t=20):
     T[0, :3, :3] = np.diag([-1.0, 1, -1])  # half a turn: w is 0
     T[:, :3, 3] = rng.normal(size=(t, 3)) * 10.0 ** np.arange(-5, 5).repeat(2)[:t, None]
     return Trajectory(1403636579.763555 + 0.05 * np.arange(t), T)
-
-
-# Cameras
-
-
-def test_camera_json(tmp_path):
-    k = [-0.3, 0.08, 1e-3, 2e-3, 0.0]
-    entries = GOOD | {"model": "pinhole", "distortion_model": "opencv_radtan (k1,k2,..)", "distortion": k}
-    camera = formats.read_camera(write(tmp_path / "c.json", entries | {"skew": -7.5}))
-    assert values(camera) == list(GOOD.values())
-    assert float(camera.skew) == -7.5
-    assert isinstance(camera.distortion, BrownConrady)
-    np.testing.assert_array_equal(camera.distortion.coefficients, [*k, 0, 0, 0])
-    assert formats.read_camera(write(tmp_path / "c.json", entries | {"distortion": [0] * 5})).distortion is None
-    for name in ("fisheye", "opencv_fisheye", "kannala_brandt"):
-        for key in ("model", "distortion_model"):
-            fisheye = formats.read_camera(write(tmp_path / "c.json", GOOD | {key: name, "distortion": [0.1, 0.2]}))
-            assert isinstance(fisheye.distortion, Fisheye)
-            np.testing.assert_array_equal(fisheye.distortion.coefficients, [0.1, 0.2, 0, 0])
-    bare = {key: value for key, value in GOOD.items() if key not in ("width", "height")}
-    path = write(tmp_path / "c.json", bare | {"cy": -1070.5})
-    assert (formats.read_camera(path).width, formats.read_camera(path, width=640).width) == (None, 640)
-
-
-@pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
-@pytest.mark.parametrize("key", ["distortion_coefficients", "dist_coeffs"])
-def test_camera_of_opencv(tmp_path, suffix, key):
-    path = tmp_path / f"c.{suffix}"
-    k = np.array([[-0.3, 0.08, 1e-3, 2e-3, 0.1]])
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("calibration_time", "today: 12:00")
-    storage.write("image_width", 640)
-    storage.write("image_height", 480)
-    storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]))
-    storage.write(key, k)
-    storage.release()
-    camera = formats.read_camera(path)
-    assert values(camera) == list(GOOD.values())
-    assert camera.distortion is not None
-    np.testing.assert_array_equal(camera.distortion.coefficients, [*k[0], 0, 0, 0])
-
-
-@pytest.mark.parametrize("head", ["", "---\n", "%YAML:1.0\n---\n", "# by a person\n"])
-def test_camera_of_ros(tmp_path, head):
-    for model, k, kind in (
-        ("plumb_bob", [-0.3, 0.1, 0, 0, 0], BrownConrady),
-        ("equidistant", [0.0] * 4, Fisheye),
-    ):
-        text = head + ROS.format(model=model, n=len(k), values=k)
-        camera = formats.read_camera(write(tmp_path / "c.yaml", text))
-        assert values(camera) == list(GOOD.values())
-        assert isinstance(camera.distortion, kind)
-        np.testing.assert_array_equal(camera.distortion.coefficients[: len(k)], k)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"fx": None}, "fx is missing; add it"),
-        ({"fx": 0}, "fx is 0"),
-        ({"fy": -3.5}, "fy is -3.5"),
-        ({"cx": float("nan")}, "cx is nan"),
-        ({"cy": float("inf")}, "cy is inf"),
-        ({"cx": "left"}, "cx is 'left'"),
-        ({"width": 0}, "width is 0"),
-        ({"height": float("inf")}, "height is inf"),
-        ({"height": 480.5}, "height is 480.5"),
-        ({"skew": float("nan")}, "skew is nan"),
-        ({"model": "omni"}, "'omni' is unknown; known are pinhole"),
-        ({"distortion_model": "fov"}, "'fov' is unknown; known are .*fisheye"),
-        ({"distortion": [float("nan")]}, "distortion is .*finite"),
-        ({"distortion": "none"}, "distortion is 'none'"),
-        ({"distortion": [0.1] * 12}, "prism"),
-        ({"model": "fisheye", "distortion": [0.1] * 5}, "model has 4"),
-        ({"camera_matrix": [1.0, 2.0]}, "camera_matrix is .*expected 9"),
-    ],
-)
-def test_bad_camera_names_file_and_key(tmp_path, change, message):
-    entries = {key: value for key, value in (GOOD | change).items() if value is not None}
-    with pytest.raises(CameraError, match=rf"bad\.json: .*{message}"):
-        formats.read_camera(write(tmp_path / "bad.json", entries))
-
-
-def test_unreadable_cameras(tmp_path):
-    with pytest.raises(CameraError, match=r"640, but 1280 was asked for"):
-        formats.read_camera(write(tmp_path / "c.json", GOOD), width=1280)
-    with pytest.raises(CameraError, match=r"none\.json: cannot be read"):
-        formats.read_camera(tmp_path / "none.json")
-    for content in ("{", "[1, 2]", "", "fx 500\nfy", "<?xml version='1.0'?><a>", "\x00\x01\x02"):
-        with pytest.raises(CameraError, match=r"c\.txt: "):
-            formats.read_camera(write(tmp_path / "c.txt", content))
-
-
-def test_shared_cameras_and_trajectories_if_present():
-    folders = [p.parent for p in (Path(__file__).parents[3] / "shared" / "data").glob("*/camera.json")]
-    if not folders:
-        pytest.skip("no shared data beside the repository")
-    for folder in folders:
-        camera = formats.read_camera(folder / "camera.json")
-        trajectory = formats.read_trajectory(folder / "groundtruth.txt")
-        assert camera.width is not None or folder.name == "tracks_oxford_dinosaur"
-        if (folder / "timestamps.txt").exists():
-            times = formats.read_timestamps(folder / "timestamps.txt")
-            assert np.isin(trajectory.times, times).all()
 
 
 # Trajectories and time stamps

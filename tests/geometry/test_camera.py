@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 from jaxtri.errors import CameraError
-from jaxtri.geometry.camera import BrownConrady, Camera, Fisheye
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady, DoubleSphere, ExtendedUnified, FieldOfView, Fisheye
 
 WIDE = BrownConrady.from_coefficients([-0.2966812740489896, 0.08085690919870842])
 FULL = BrownConrady.from_coefficients([0.3, -0.2, 1e-3, -2e-3, 0.05, 0.35, -0.1, 0.02])
 FISHEYE = Fisheye.from_coefficients([-0.02, 0.01, -0.004, 0.0006])
+PRISM = BrownConrady.from_coefficients([0.3, -0.2, 1e-3, -2e-3, 0.05, 0.35, -0.1, 0.02, 2e-3, -1e-3, -3e-3, 5e-4])
+FOV = FieldOfView.from_coefficients([0.93])
+DS = DoubleSphere.from_coefficients([-0.21, 0.58])
+EUCM = ExtendedUnified.from_coefficients([0.6, 1.1])
 FOLD = BrownConrady.from_coefficients([-0.3])  # at a radius of 1.054 the image turns back
 SIZE = {"width": 752, "height": 480}
 
@@ -33,7 +38,7 @@ def ray_grid(degrees):
     return np.tan(angle)[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1)
 
 
-@pytest.mark.parametrize("distortion", [None, WIDE, FULL])
+@pytest.mark.parametrize("distortion", [None, WIDE, FULL, PRISM])
 def test_pinhole_agrees_with_opencv_both_ways(distortion):
     cam = camera(distortion)
     K = np.asarray(cam.K)
@@ -65,18 +70,18 @@ def test_fisheye_with_skew_agrees_with_opencv_both_ways():
     np.testing.assert_allclose(back, expected.reshape(16, 24, 2), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("distortion", [None, WIDE, FULL, FISHEYE])
+@pytest.mark.parametrize("distortion", [None, WIDE, FULL, PRISM, FISHEYE, FOV, DS, EUCM])
 def test_round_trip_of_the_whole_image(distortion):
     cam = camera(distortion, skew=-7.0)
     pixels = jnp.asarray(pixel_grid())
-    if distortion is FISHEYE:
+    if distortion in (FISHEYE, FOV, DS, EUCM):
         pixels = to_pixels(cam, jnp.asarray(ray_grid(89)))
     back = to_pixels(cam, to_normalised(cam, pixels))
     assert np.abs(np.asarray(back) - np.asarray(pixels)).max() < 1e-9
     assert jax.eval_shape(to_normalised, cam, jax.ShapeDtypeStruct((2,), jnp.float64)).shape == (2,)
 
 
-@pytest.mark.parametrize("distortion", [FULL, FISHEYE])
+@pytest.mark.parametrize("distortion", [FULL, PRISM, FISHEYE, FOV, DS, EUCM])
 def test_derivatives_of_every_leaf_are_those_of_central_differences(distortion):
     cam = camera(distortion, skew=2.0)
     pixels = pixel_grid()
@@ -122,14 +127,57 @@ def test_float32_is_kept_close_and_finite_for_wild_points():
     points = pixel_grid().astype(np.float32)
     points[-1, :6] = [[0, 0], [1, 0], [3, 4], [-70, 1e-30], [1e6, -1e6], [1e30, -1e30]]
     pole = BrownConrady.from_coefficients([0, 0, 0, 0, 0, -1.0])
-    for distortion in (FOLD, pole, FULL, FISHEYE):
+    # Lenses at the ends of what they may be: nothing but a pinhole, and a pole before the image.
+    ends = [FieldOfView.from_coefficients([x]) for x in (0.0, 3.14)]
+    ends += [DoubleSphere.from_coefficients(x) for x in ((-0.9, 0.1), (0.0, 0.0), (0.9, 1.0))]
+    ends += [ExtendedUnified.from_coefficients(x) for x in ((0.0, 1.0), (1.0, 1e-6))]
+    for distortion in (FOLD, pole, FULL, PRISM, FISHEYE, FOV, DS, EUCM, *ends):
         values, gradients = run(camera(distortion, dtype=jnp.float32), jnp.asarray(points))
         for leaf in jax.tree.leaves((values, gradients)):
             assert leaf.dtype == jnp.float32
             assert np.isfinite(leaf).all()
-        if distortion is FULL or distortion is FISHEYE:
+        if distortion in (FULL, PRISM, FISHEYE):
             back = to_pixels(camera(distortion, dtype=jnp.float32), values[1])
             assert np.abs(np.asarray(back) - points)[:-1].max() < 1e-3
+
+
+def test_lenses_are_those_of_their_papers():
+    """By the points of space that the papers project: the angle of Devernay, the spheres of Usenko and Khomutenko."""
+    xy = ray_grid(88)
+    X = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], -1)
+    r = np.linalg.norm(xy, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        fov = np.where(r > 0, xy / r * np.arctan(2 * r * np.tan(0.93 / 2)) / 0.93, 0)
+    on_first = X / np.linalg.norm(X, axis=-1, keepdims=True)
+    on_second = on_first + np.array([0, 0, -0.21])
+    on_second /= np.linalg.norm(on_second, axis=-1, keepdims=True)
+    ds = on_second[..., :2] / (0.58 + (1 - 0.58) * on_second[..., 2:])
+    eucm = xy / (0.6 * np.sqrt(1.1 * r**2 + 1) + 0.4)
+    for lens, expected in ((FOV, fov), (DS, ds), (EUCM, eucm)):
+        pixels = to_pixels(camera(lens), jnp.asarray(xy))
+        np.testing.assert_allclose(pixels, expected * [420.5, 421.7] + [355.2, 250.3], rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "distortion", [None, FULL, PRISM, FISHEYE, FOV, DS, EUCM, FieldOfView.from_coefficients([1e-3])]
+)
+def test_the_magnification_is_the_slope_at_the_centre(distortion):
+    cam = camera(distortion)
+    slope = jax.jacfwd(cam.to_pixels)(jnp.zeros(2))
+    np.testing.assert_allclose(slope, cam.magnification * np.diag([420.5, 421.7]), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(cam.focal**2, np.linalg.det(slope))
+
+
+@pytest.mark.parametrize("size", [(376, 240), (1504, 960), (250, 160), (251, 160)])
+def test_a_scaled_camera_sees_the_same_picture(size):
+    cam = camera(FULL, skew=3.0)
+    scaled = cam.scaled(*size)
+    xy = jnp.asarray(ray_grid(30))
+    share = (np.asarray(to_pixels(cam, xy)) + 0.5) / [752, 480]
+    np.testing.assert_allclose((np.asarray(to_pixels(scaled, xy)) + 0.5) / size, share, rtol=1e-12)
+    assert (scaled.width, scaled.height) == size
+    with pytest.raises(CameraError, match="cropped or stretched"):
+        cam.scaled(640, 480)
 
 
 def test_beyond_the_fold_the_answer_is_the_fold_on_the_same_side():
@@ -159,8 +207,14 @@ def test_bad_parameter_is_named(name, value):
 
 
 def test_bad_distortions_and_fields_of_view():
-    with pytest.raises(CameraError, match="prism"):
-        BrownConrady.from_coefficients([0.1] * 12)
+    with pytest.raises(CameraError, match="tilt"):
+        BrownConrady.from_coefficients([0.1] * 14)
+    with pytest.raises(CameraError, match=r"omega is 3\.2"):
+        FieldOfView.from_coefficients([3.2])
+    with pytest.raises(CameraError, match="xi is -1"):
+        DoubleSphere.from_coefficients([-1.0, 0.5])
+    with pytest.raises(CameraError, match="beta is 0"):
+        ExtendedUnified.from_coefficients([0.5, 0.0])
     assert BrownConrady.from_coefficients([0.1] * 4 + [0.0] * 10).coefficients.shape == (8,)
     with pytest.raises(CameraError, match="model has 4"):
         Fisheye.from_coefficients([0.1] * 5)

@@ -11,7 +11,8 @@ from tracks import sideways
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.filters.diagnostics import Diagnostics
 from jaxtri.filters.scan import checkpointed
-from jaxtri.geometry.camera import BrownConrady, Camera
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady
 from jaxtri.models.point_noise import PointNoise
 from jaxtri.odometry import replay
 from jaxtri.odometry.driver import Odometry

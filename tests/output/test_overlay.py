@@ -5,7 +5,8 @@ import pytest
 from jaxlie import SO3
 
 from jaxtri.errors import InputError
-from jaxtri.geometry.camera import BrownConrady, Camera
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady
 from jaxtri.output.overlay import Wireframe, car, dominant_plane, draw_text, draw_wireframe, place
 
 SIZE = {"width": 320, "height": 240}

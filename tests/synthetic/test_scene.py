@@ -6,7 +6,8 @@ import pytest
 from jaxlie import SE3
 
 from jaxtri.errors import InputError
-from jaxtri.geometry.camera import BrownConrady, Camera
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady
 from jaxtri.synthetic import Scene, blank_scene, box, laboratory, planar_scene, quad, render, rendered_sequence
 from jaxtri.synthetic.textures import checks, plain
 
