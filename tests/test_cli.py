@@ -137,7 +137,10 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
     assert "--out" in fails(["track", sequence, "--camera", camera, "--out", file, "--quiet"], capsys)
     entries = json.loads(camera.read_text()) | {"width": 320, "height": 240}
     (tmp_path / "small.json").write_text(json.dumps(entries))
-    assert "320" in track(sequence, "--camera", tmp_path / "small.json")
+    assert "--scale-camera" in track(sequence, "--camera", tmp_path / "small.json")
+    small = json.loads(camera.read_text()) | {"width": 640, "height": 640}
+    (tmp_path / "small.json").write_text(json.dumps(small))
+    assert "another aspect" in track(sequence, "--camera", tmp_path / "small.json", "--scale-camera")
     assert not (tmp_path / "out").exists()
 
 

@@ -194,6 +194,8 @@ def read_intrinsics(entries: Entries, *, model: Sequence[str] = (), size: Size |
 
 def from_matrix(name: str, values: Sequence[float]) -> tuple[float, float, float, float, float]:
     """fx, fy, cx, cy, skew of a 3x3 matrix, row by row. Raises `CameraError` where it is transposed or none."""
+    if not any(values):
+        raise CameraError(f"{name} is all zeros, as of a camera that was not calibrated; calibrate it")
     fx, skew, cx, below, fy, cy, *last = values
     if any(last[:2]) and not (cx or cy):
         raise CameraError(

@@ -406,6 +406,7 @@ def test_of_several_cameras_one_is_chosen(tmp_path):
         ("<calibration><f>3</f></calibration>", "only OpenCV's"),
         ("a: [1\nb: 2\n", "YAML: .* in line 2"),
         # Numbers that cannot be.
+        ({"K": [0.0] * 9, "D": []}, "K is all zeros.*not calibrated"),
         (GOOD | {"fx": 0.78, "fy": 1.06, "cx": 0.5, "cy": 0.5}, "fx is 0.78 .*normalised"),
         ({"fx": 4.1, "fy": 4.1, "cx": 320, "cy": 240}, "fx is 4.1 .*millimetres"),
         (GOOD | {"fx": 24, "fy": 24}, "fx is 24 .*millimetres"),
