@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jaxtri.errors import CameraError, InputError, JaxtriError, TruncatedVideoWarning
+from jaxtri.errors import CameraError, InputError, InputWarning, JaxtriError, TruncatedVideoWarning
 
 # The rest is imported where it is called: help and a wrong option need not wait for it.
 if TYPE_CHECKING:
@@ -73,6 +73,8 @@ class Evaluate:
     """Trajectory file: TUM, KITTI or EuRoC."""
     groundtruth: tyro.conf.Positional[Path]
     """Trajectory file: TUM, KITTI or EuRoC."""
+    times: Path | None = None
+    """Times of the lines of a KITTI file, which has none; by default a times.txt beside it, where they are needed."""
     scale: bool = True
     """Align the scale too, Sim(3), as a monocular trajectory needs; `--no-scale` for SE(3)."""
     json: Path | None = None
@@ -111,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
     keep_programs()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("always", TruncatedVideoWarning)
+            warnings.simplefilter("always", InputWarning)
             warnings.showwarning = _show
             {Track: _track, Evaluate: _evaluate, Demo: _demo}[type(command)](command)
     except (JaxtriError, OSError) as error:
@@ -120,7 +122,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, TruncatedVideoWarning):
+    if issubclass(category, InputWarning):
         print(f"jaxtri: warning: {message}", file=sys.stderr)
 
 
@@ -217,11 +219,13 @@ def _how(camera: "Camera", options: Track) -> dict[str, Any]:
 
 
 def _evaluate(options: Evaluate) -> None:
-    from jaxtri.formats import read_trajectory, write_json
+    from jaxtri.formats import write_json
+    from jaxtri.formats.trajectories import read_pair
     from jaxtri.output.report import errors_text
     from jaxtri.trajectory import evaluate
 
-    found = evaluate(read_trajectory(options.estimate), read_trajectory(options.groundtruth), with_scale=options.scale)
+    pair = read_pair(options.estimate, options.groundtruth, options.times)
+    found = evaluate(*pair, with_scale=options.scale)
     print(errors_text(found))
     if options.json is not None:
         write_json(options.json, asdict(found))

@@ -25,7 +25,11 @@ class TruncatedVideoError(VideoError):
     """Fewer frames could be decoded than the source declares (raised with `strict` only)."""
 
 
-class TruncatedVideoWarning(UserWarning):
+class InputWarning(UserWarning):
+    """What was noticed of an input, and how it is taken; the command line shows each."""
+
+
+class TruncatedVideoWarning(InputWarning):
     """Fewer frames could be decoded than the source declares."""
 
 
@@ -35,6 +39,10 @@ class UnitsWarning(UserWarning):
 
 class TrajectoryError(InputError):
     """A trajectory file that cannot be parsed, or trajectories that cannot be compared."""
+
+
+class TrajectoryWarning(InputWarning):
+    """Lines of a trajectory that are left out, or times that had to be found elsewhere."""
 
 
 class InitialisationError(JaxtriError):

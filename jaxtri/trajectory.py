@@ -1,6 +1,7 @@
 """Trajectories, and how far one is from another (`T_world_camera` throughout: poses camera to world)."""
 
 import math
+import warnings
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int
 
 from jaxtri.checks import number
-from jaxtri.errors import TrajectoryError
+from jaxtri.errors import TrajectoryError, TrajectoryWarning
 
 # Largest departure of R R' from the identity: wide, since files carry few digits; it is for matrices of another kind.
 RIGID = 1e-3
@@ -31,6 +32,8 @@ class Trajectory:
             units first, then of the rotation vector dtheta in camera axes and radians, with R_estimate = R_true
             exp(dtheta).
         status: (t,) int, codes of whoever made the trajectory, or None; `jaxtri.Status` for those of a run.
+        frames: Number of frames where `times` are their numbers from 0 and no seconds, as of KITTI's files; None where
+            they are seconds.
     """
 
     # The shapes are checked below, with a message of our own.
@@ -38,6 +41,7 @@ class Trajectory:
     T_world_camera: np.ndarray
     covariance: np.ndarray | None = None
     status: np.ndarray | None = None
+    frames: int | None = None
 
     def __post_init__(self):
         shapes = {"times": (), "T_world_camera": (4, 4), "covariance": (6, 6), "status": ()}
@@ -61,6 +65,8 @@ class Trajectory:
             raise TrajectoryError(
                 f"times[{i}] = {self.times[i]} does not come after times[{i - 1}] = {self.times[i - 1]}"
             )
+        if self.frames is not None and not set(self.times.tolist()) <= set(range(self.frames)):
+            raise TrajectoryError(f"with {self.frames} frames times must be whole numbers from 0 to {self.frames - 1}")
         R = self.rotations
         rigid = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max((1, 2)) < RIGID
         rigid &= (np.linalg.det(R) > 0) & (np.abs(self.T_world_camera[:, 3] - [0, 0, 0, 1]).max(-1) < 1e-9)
@@ -246,10 +252,15 @@ def evaluate(
 ) -> Evaluation:
     """Compare two trajectories frame by frame, in JAX's default float.
 
-    Frames are matched when each is the other's nearest in time, within `max_time_difference` seconds.
-    Raises `TrajectoryError` where fewer than three match. Sturm et al. 2012, section V.
+    Frames are matched when each is the other's nearest in time, within `max_time_difference` seconds. Where one has
+    no times (`Trajectory.frames`), frames of the same number are matched, and only if both have as many; where the
+    other one has times, a `TrajectoryWarning` says so. Raises `TrajectoryError` where they are not comparable, or
+    fewer than three frames match. Sturm et al. 2012, section V.
     """
-    i, j = associate(estimate.times, reference.times, max_time_difference)
+    if estimate.frames is None and reference.frames is None:
+        i, j = associate(estimate.times, reference.times, max_time_difference)
+    else:
+        i, j = _same_numbers(estimate, reference)
     if len(i) < MATCHES:
         spans = [f"{x.times[0]:.9g} to {x.times[-1]:.9g} s ({len(x)} frames)" for x in (estimate, reference)]
         raise TrajectoryError(
@@ -271,6 +282,27 @@ def evaluate(
         rpe_rotation_deg=math.degrees(rotation),
         rotation_rmse_deg=math.degrees(orientation),
     )
+
+
+def _same_numbers(estimate: Trajectory, reference: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the frames of one number, where at least one trajectory has no times."""
+    lengths = [len(x) if x.frames is None else x.frames for x in (estimate, reference)]
+    counts = f"the estimate has {lengths[0]} frames and the reference {lengths[1]}"
+    both = estimate.frames is not None and reference.frames is not None
+    which = (
+        "neither has times" if both else f"the {'reference' if estimate.frames is None else 'estimate'} has no times"
+    )
+    if lengths[0] != lengths[1]:
+        remedy = (
+            "give the shorter one with times (TUM format), and --times FILE for the other"
+            if both
+            else "give the time of every line of the KITTI file (--times FILE, or times.txt beside it)"
+        )
+        raise TrajectoryError(f"{which} (KITTI format), and {counts}: which belong together is not known; {remedy}")
+    if not both:
+        warnings.warn(f"{which} (KITTI format): line by line, as {counts}", TrajectoryWarning, stacklevel=3)
+    numbers = [np.arange(len(x)) if x.frames is None else x.times.astype(int) for x in (estimate, reference)]
+    return np.intersect1d(*numbers, assume_unique=True, return_indices=True)[1:]
 
 
 def associate(

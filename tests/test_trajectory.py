@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxtri.errors import TrajectoryError
+from jaxtri.errors import TrajectoryError, TrajectoryWarning
 from jaxtri.trajectory import (
     Trajectory,
     absolute_error,
@@ -263,6 +263,26 @@ def test_evaluate_on_part_of_the_reference():
         evaluate(trajectory(reference), trajectory(reference, times + 100))
 
 
+def test_frame_numbers_are_never_compared_with_seconds():
+    """A trajectory without times beside one at 10 Hz: six of sixty frames matched, at the whole seconds."""
+    reference, noisy = poses(noise=0.05, t=60)
+    timed = trajectory(noisy)
+    right = evaluate(timed, trajectory(reference))
+    numbered = Trajectory(np.arange(60.0), reference, frames=60)
+    with pytest.warns(TrajectoryWarning, match="the reference has no times.*60 frames.*60"):
+        assert evaluate(timed, numbered) == right
+    with pytest.warns(TrajectoryWarning, match="the estimate has no times"):
+        assert evaluate(numbered, timed).matched == 60
+    assert evaluate(Trajectory(np.arange(60.0), noisy, frames=60), numbered) == right
+    part = Trajectory(np.arange(60.0)[6:18], noisy[6:18], frames=60)  # the others were NaN
+    assert evaluate(part, numbered) == evaluate(Trajectory(timed.times[6:18], noisy[6:18]), trajectory(reference))
+    few = Trajectory(np.arange(6.0), noisy[::10], frames=6)
+    with pytest.raises(TrajectoryError, match=r"neither has times.* 6 frames .* 60.*times"):
+        evaluate(few, numbered)
+    with pytest.raises(TrajectoryError, match=r"the reference has no times \(KITTI.* 6 frames .* 60.*--times"):
+        evaluate(Trajectory(timed.times[::10], noisy[::10]), numbered)
+
+
 def test_trajectory_names_what_is_wrong():
     T = poses()[0][:4]
     times = np.arange(4.0)
@@ -277,6 +297,7 @@ def test_trajectory_names_what_is_wrong():
         (r"T_world_camera\[2\] is not finite", (times, bad)),
         (r"times\[2\] = 1.0 does not come after", (np.asarray([0, 1, 1, 2.0]), T)),
         (r"T_world_camera\[1\] is no rigid", (times, left_handed)),
+        ("whole numbers from 0 to 2", (times, T, None, None, 3)),
     ]
     for message, arguments in cases:
         with pytest.raises(TrajectoryError, match=message):
