@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jaxtri.errors import CameraError, InputError, InputWarning, JaxtriError, TruncatedVideoWarning
+from jaxtri.errors import CameraError, InputError, InputWarning, JaxtriError
 
 # The rest is imported where it is called: help and a wrong option need not wait for it.
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def _overlay(options: Track, run: Any, camera: "Camera", source: Path | str, fps
     from jaxtri.vision.video import open_source
 
     with warnings.catch_warnings(), open_source(source, fps=options.fps) as again:
-        warnings.simplefilter("ignore", TruncatedVideoWarning)  # said once already
+        warnings.simplefilter("ignore", InputWarning)  # said once already
         path = options.out / "overlay.mp4"
         try:
             return [write_overlay(run, again, camera, path, fps, at=options.place, progress=not options.quiet)]

@@ -29,6 +29,10 @@ class InputWarning(UserWarning):
     """What was noticed of an input, and how it is taken; the command line shows each."""
 
 
+class SourceWarning(InputWarning):
+    """What a source of frames does not say, or says in an unusual way, and how it is taken."""
+
+
 class TruncatedVideoWarning(InputWarning):
     """Fewer frames could be decoded than the source declares."""
 

@@ -1,9 +1,7 @@
 """What `jaxtri.vision.video` reads from: OpenCV's captures and folders of images, one frame at a time."""
 
 import contextlib
-import math
 import os
-import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +11,7 @@ import cv2
 import numpy as np
 
 from jaxtri.errors import VideoError
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""The files of a folder that count as frames; case does not matter."""
+from jaxtri.vision.layouts import lay_out
 
 Item = tuple[int, float | None, np.ndarray | str]
 """Index, time in seconds if known, and the image, or the reason why it cannot be decoded."""
@@ -48,6 +44,7 @@ class Capture:
     def __init__(self, source: str | int, name: str):
         self.index, self.live = 0, isinstance(source, int)
         self.start: float | None = None
+        self.numbers: list[int] | None = None
         with quiet():
             self.capture = cv2.VideoCapture(source)
             opened = self.capture.isOpened()
@@ -84,15 +81,8 @@ class Folder:
     """The images of a folder."""
 
     def __init__(self, folder: Path):
-        self.files = _images(folder) or _images(folder / "frames")
-        if not self.files:
-            raise VideoError(f"{folder}: no images here or in {folder / 'frames'} ({', '.join(IMAGE_SUFFIXES)})")
-        self.times: list[float] | None = None
-        home = self.files[0].parent
-        for stamps in (home / "timestamps.txt", home.parent / "timestamps.txt"):
-            if stamps.is_file():
-                self.times, self.files = _read_timestamps(stamps, self.files)
-                break
+        found = lay_out(folder)
+        self.files, self.times, self.numbers = found.files, found.times, found.numbers
         self.declared: int | None = len(self.files)
         self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
         self.index = -1
@@ -109,18 +99,6 @@ class Folder:
         """Nothing is held open between images."""
 
 
-def _images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-    return sorted(
-        files,
-        key=lambda p: [
-            (part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", p.name)
-        ],
-    )
-
-
 def _read_image(path: Path) -> np.ndarray | str:
     try:
         data = np.fromfile(path, np.uint8)
@@ -131,24 +109,3 @@ def _read_image(path: Path) -> np.ndarray | str:
     with quiet():
         image = cv2.imdecode(data, cv2.IMREAD_COLOR) if whole else None
     return f"{path.name} is not a readable image" if image is None else image
-
-
-def _read_timestamps(path: Path, images: list[Path]) -> tuple[list[float], list[Path]]:
-    lines = [(n, line.split()) for n, line in enumerate(path.read_text().splitlines(), 1)]
-    lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
-    if len(lines) != len(images):
-        raise VideoError(f"{path} has {len(lines)} lines for {len(images)} images in {images[0].parent}")
-    times: list[float] = []
-    for n, words in lines:
-        try:
-            time_s = float(words[0])
-        except ValueError:
-            time_s = math.nan
-        if not math.isfinite(time_s) or (times and time_s <= times[-1]):
-            raise VideoError(f"{path}, line {n}: {words[0]!r} is not a time in seconds later than the one before")
-        times.append(time_s)
-    if all(len(words) > 1 for _, words in lines):
-        images = [path.parent / words[1] for _, words in lines]
-        if missing := [str(p) for p in images if not p.is_file()]:
-            raise VideoError(f"{path} names {missing[0]}, which does not exist ({len(missing)} missing in all)")
-    return times, images

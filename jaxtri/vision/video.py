@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxtri.errors import ResolutionChangeError, TruncatedVideoError, TruncatedVideoWarning, VideoError
+from jaxtri.errors import ResolutionChangeError, SourceWarning, TruncatedVideoError, TruncatedVideoWarning, VideoError
 from jaxtri.formats import atomic_path
-from jaxtri.vision.readers import IMAGE_SUFFIXES, Capture, Folder, Item, quiet
+from jaxtri.vision.layouts import IMAGE_SUFFIXES
+from jaxtri.vision.readers import Capture, Folder, Item, quiet
 
 DEFAULT_FPS = 25.0
 """Frames a second of a source that has no clock of its own and was given none."""
@@ -42,6 +43,7 @@ class Frame:
 class _Reader(Protocol):
     declared: int | None
     fps: float | None
+    numbers: list[int] | None
 
     def read(self) -> Item | None:
         """The next frame, or None at the end."""
@@ -70,6 +72,7 @@ class FrameSource:
         self.fps = fps or reader.fps or DEFAULT_FPS
         self.decoded = 0
         self._reader, self._strict, self._override = reader, strict, fps is not None
+        self._timed = fps is not None or reader.fps is not None or isinstance(reader, Capture)
         self._time = -math.inf
         self._bad: list[str] = []
         self._ended = False
@@ -83,6 +86,13 @@ class FrameSource:
             reader.close()
             raise VideoError(f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1]))
         self.size = _size(self._first)
+        if not self._timed:
+            warnings.warn(
+                f"{name}: no list of times and no names of images say when they were taken: {DEFAULT_FPS:g} frames a "
+                "second are assumed; give the rate (--fps) or a timestamps.txt",
+                SourceWarning,
+                stacklevel=3,
+            )
 
     def _read(self) -> Frame | None:
         while (item := self._reader.read()) is not None:
@@ -93,7 +103,8 @@ class FrameSource:
                 self._bad.append(image)
                 continue
             if stamp is None or self._override or not math.isfinite(stamp):
-                stamp = index / self.fps
+                numbers = self._reader.numbers
+                stamp = (index if numbers is None else numbers[index]) / self.fps
             if stamp <= self._time:
                 stamp = self._time + 1 / self.fps
             self._time = stamp
@@ -143,9 +154,12 @@ class FrameSource:
 def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = None, strict: bool = False) -> FrameSource:
     """Open a video file, a folder of images, or a camera by its number (an integer or, say, "0").
 
-    A folder gives its images in natural order ("2" before "10"), or those of its subfolder `frames` if it has
-    none itself. A `timestamps.txt` beside them or one level above gives the times: seconds, then optionally
-    the file's name, a line a frame. `fps` overrides the times of any source. A camera's times count from its
+    A folder gives its images in natural order ("2" before "10", but .05 before .1), or those below it as data sets have
+    them: `frames`, EuRoC's `cam0/data`, KITTI's `image_0` and `image_00/data`, TUM's `rgb`. Times come from a list
+    beside them or one folder above (`timestamps.txt`, `times.txt`, `data.csv`, `rgb.txt`: seconds, whole nanoseconds or
+    dates, then optionally the file's name, a line a frame), or else from the names of the files, if they are seconds
+    or nanoseconds. Numbered files are `fps` apart, a missing number counts as a frame; where nothing says the rate, a
+    `SourceWarning` says which is assumed. `fps` overrides the times of any source. A camera's times count from its
     first frame, by the clock of this computer.
 
     Raises VideoError if there is nothing to read, the file is no video, or the time stamps do not fit the
