@@ -45,6 +45,7 @@ class Capture:
         self.index, self.live = 0, isinstance(source, int)
         self.start: float | None = None
         self.numbers: list[int] | None = None
+        self.last, self.longest = 0.0, 0.0  # time of the frame before, longest time between two
         with quiet():
             self.capture = cv2.VideoCapture(source)
             opened = self.capture.isOpened()
@@ -55,6 +56,17 @@ class Capture:
         # Containers without an index give nonsense (-9e18 for a bare MJPEG stream).
         self.declared = int(count) if not self.live and 0 < count < 1e9 else None
         self.fps = fps if 0 < fps < 1e4 else None
+        self.counted = not self.live and _is_counted(Path(str(source)))
+
+    def whole(self, decoded: int) -> bool:
+        """Whether the file was read to its end, given how many frames came out."""
+        if self.declared is None or decoded >= self.declared:
+            return True
+        # Matroska and streams hold no count: what is declared there is duration times rate, which a variable rate, or
+        # sound that goes on, makes too large. The frames then end early where their times do.
+        if self.counted or self.fps is None or not self.last:
+            return False
+        return self.last + max(self.longest, 1 / self.fps) > (self.declared - 1.5) / self.fps
 
     def read(self) -> Item | None:
         """The next frame, or None at the end (a file) or when the camera stops giving any."""
@@ -69,12 +81,21 @@ class Capture:
         else:
             seconds = self.capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             stamp = seconds if 0 <= seconds < 1e9 else None
+            if stamp is not None:
+                self.longest, self.last = max(self.longest, stamp - self.last), stamp
         self.index += 1
         return self.index - 1, stamp, image
 
     def close(self) -> None:
         """Release the file or camera."""
         self.capture.release()
+
+
+def _is_counted(path: Path) -> bool:
+    """Whether the container has an index, and with it the number of frames: MP4, MOV and AVI."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free") or head[:4] == b"RIFF"
 
 
 class Folder:
@@ -86,6 +107,10 @@ class Folder:
         self.declared: int | None = len(self.files)
         self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
         self.index = -1
+
+    def whole(self, decoded: int) -> bool:
+        """Whether every image could be decoded."""
+        return decoded == len(self.files)
 
     def read(self) -> Item | None:
         """The next image, or why it cannot be decoded; None at the end."""

@@ -49,6 +49,10 @@ class _Reader(Protocol):
         """The next frame, or None at the end."""
         ...
 
+    def whole(self, decoded: int) -> bool:
+        """Whether `decoded` frames are all that there are."""
+        ...
+
     def close(self) -> None: ...
 
 
@@ -61,7 +65,8 @@ class FrameSource:
     Attributes:
         name: What the source is called in messages.
         size: (width, height) in pixels.
-        declared: Frames that the source claims to hold, None where it makes no claim.
+        declared: Frames that the source claims to hold, None where it makes no claim. Containers without a count (WebM,
+            MPEG) claim their duration times the rate.
         fps: Nominal frames a second; `DEFAULT_FPS` where neither source nor caller says.
         decoded: Frames handed out so far.
     """
@@ -132,7 +137,7 @@ class FrameSource:
 
     def _finish(self) -> None:
         self.close()
-        if self.declared is not None and self.decoded < self.declared:
+        if not self._reader.whole(self.decoded):
             message = f"{self.name}: {self.decoded} frames decoded of {self.declared} declared"
             message += f" (first failure: {self._bad[0]})" if self._bad else "; the file ends early"
             if self._strict:
