@@ -104,6 +104,9 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; bad input ends with a message and exit code 2."""
+    # A file may be named like an option; "./-clip.mp4" is none.
+    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = [f"./{a}" if a.startswith("-") and Path(a).exists() else a for a in arguments]
     command = tyro.cli(Command, args=arguments, prog="jaxtri", description=__doc__)  # pyright: ignore
     import jax
 
@@ -129,7 +132,7 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 def _track(options: Track) -> None:
     from jaxtri.odometry.run import track, warm_up
     from jaxtri.output.report import run_text
-    from jaxtri.output.results import write_results
+    from jaxtri.output.results import spare, write_results
     from jaxtri.vision.video import open_source, spool
 
     _check(options)
@@ -137,6 +140,8 @@ def _track(options: Track) -> None:
     if live and options.max_frames is None:
         print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
     with open_source(options.source, fps=options.fps, strict=options.strict) as source:
+        if not live:
+            spare(options.out, [Path(p) for p in (options.source, options.camera) if p is not None], source.folder)
         camera = _camera(options, source.size)
         how = _how(camera, options)
         if live:

@@ -159,6 +159,24 @@ def test_sequences_without_motion_say_so(kind, sequence, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_results_neither_overwrite_the_source_nor_count_as_its_frames(sequence, tmp_path, capsys):
+    camera = ["--camera", sequence / "camera.json", "--quiet"]
+    for source, out in ((sequence, sequence), (sequence, sequence / "frames"), (sequence / "frames",) * 2):
+        message = fails(["track", source, *camera, "--out", out], capsys)
+        assert "--out" in message
+        assert "frames of the source" in message
+    clip = tmp_path / "overlay.mp4"
+    write_video(clip, [cv2.imread(str(p)) for p in sorted((sequence / "frames").iterdir())[:8]], 25.0)
+    before = clip.read_bytes()
+    (tmp_path / "linked").symlink_to(tmp_path)
+    assert "overwrite" in fails(["track", clip, *camera, "--out", tmp_path / "linked"], capsys)
+    assert clip.read_bytes() == before
+    copy = tmp_path / "run.json"
+    copy.write_bytes((sequence / "camera.json").read_bytes())
+    assert "overwrite" in fails(["track", sequence, "--camera", copy, "--out", tmp_path], capsys)
+    assert sorted(p.name for p in sequence.iterdir()) == ["camera.json", "frames", "groundtruth.txt", "timestamps.txt"]
+
+
 def test_a_truncated_video_warns_and_fails_with_strict(sequence, tmp_path, capsys):
     images = [cv2.imread(str(p)) for p in sorted((sequence / "frames").iterdir())]
     clip = tmp_path / "clip.avi"

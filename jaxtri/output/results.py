@@ -22,6 +22,35 @@ PACKAGES = ("jaxtri", "jax", "equinox", "optimistix", "jaxlie", "numpy", "opencv
 NAMES = {int(s): s.name.lower() for s in Status}
 
 
+FILES = (
+    "trajectory.txt",
+    "trajectory_causal.txt",
+    "trajectory.png",
+    "points.ply",
+    "run.json",
+    "overlay.mp4",
+    "recording.rrd",
+)
+"""Everything that a run may write into its folder."""
+
+
+def spare(out: Path, inputs: Iterable[Path], frames: Path | None) -> None:
+    """Make sure that the results of a run, written to `out`, leave what it reads as it is.
+
+    `inputs` are files or folders that it reads; `frames` is the folder that holds the images, if there are any. Raises
+    `InputError` where results would take the place of an input, or stand where the images of the source are looked for.
+    """
+    for path in inputs:
+        if any((out / name).exists() and path.exists() and (out / name).samefile(path) for name in FILES):
+            raise InputError(f"--out {out}: the results would overwrite {path}, which is read; give another folder")
+        places = () if frames is None else (frames.resolve(), *frames.resolve().parents)
+        if path.is_dir() and out.resolve() in (p for p in places if p.is_relative_to(path.resolve())):
+            raise InputError(
+                f"--out {out} is where the frames of the source {path} are looked for, and trajectory.png would count "
+                "as one of them; give another folder"
+            )
+
+
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that the figures of a run depend on."""
     return {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in PACKAGES}

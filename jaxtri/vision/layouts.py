@@ -31,11 +31,13 @@ class Layout:
     """The images of a folder in order.
 
     Attributes:
+        home: The folder that holds them.
         files: Paths of the images.
         times: Seconds, as a list says or as the files are named; None where neither does.
         numbers: Numbers of the frames, the first of them 0, a missing one left out; None where the files have none.
     """
 
+    home: Path
     files: list[Path]
     times: list[float] | None
     numbers: list[int] | None
@@ -57,8 +59,8 @@ def lay_out(folder: Path) -> Layout:
             path = place / name.format(folder=home.name)
             if path.is_file() and (found := _listed(path, files, must_name=name not in _LISTS[:2])):
                 listed, times = found
-                return Layout(listed, times, numbers if listed == files else None)
-    return Layout(files, times, numbers)
+                return Layout(home, listed, times, numbers if listed == files else None)
+    return Layout(home, files, times, numbers)
 
 
 def _images(folder: Path) -> list[Path]:

@@ -44,10 +44,11 @@ class Capture:
     def __init__(self, source: str | int, name: str):
         self.index, self.live = 0, isinstance(source, int)
         self.start: float | None = None
+        self.folder: Path | None = None
         self.numbers: list[int] | None = None
         self.last, self.longest = 0.0, 0.0  # time of the frame before, longest time between two
         with quiet():
-            self.capture = cv2.VideoCapture(source)
+            self.capture = _opened(source)
             opened = self.capture.isOpened()
         if not opened:
             hint = "is it connected and free?" if self.live else "not a video that OpenCV can decode, or cut short"
@@ -91,6 +92,15 @@ class Capture:
         self.capture.release()
 
 
+def _opened(source: str | int) -> cv2.VideoCapture:
+    if isinstance(source, int):
+        return cv2.VideoCapture(source)
+    # FFmpeg takes what comes before a colon for a protocol, but not in an absolute path; where it fails OpenCV takes a
+    # per cent sign for the pattern of a sequence of images.
+    path = str(Path(source).absolute())
+    return cv2.VideoCapture(path, cv2.CAP_FFMPEG if "%" in path else cv2.CAP_ANY)
+
+
 def _is_counted(path: Path) -> bool:
     """Whether the container has an index, and with it the number of frames: MP4, MOV and AVI."""
     with path.open("rb") as file:
@@ -104,6 +114,7 @@ class Folder:
     def __init__(self, folder: Path):
         found = lay_out(folder)
         self.files, self.times, self.numbers = found.files, found.times, found.numbers
+        self.folder: Path | None = found.home
         self.declared: int | None = len(self.files)
         self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
         self.index = -1

@@ -43,6 +43,7 @@ class Frame:
 class _Reader(Protocol):
     declared: int | None
     fps: float | None
+    folder: Path | None
     numbers: list[int] | None
 
     def read(self) -> Item | None:
@@ -67,13 +68,14 @@ class FrameSource:
         size: (width, height) in pixels.
         declared: Frames that the source claims to hold, None where it makes no claim. Containers without a count (WebM,
             MPEG) claim their duration times the rate.
+        folder: Folder that holds the images, None for a video.
         fps: Nominal frames a second; `DEFAULT_FPS` where neither source nor caller says.
         decoded: Frames handed out so far.
     """
 
     def __init__(self, name: str, reader: _Reader, fps: float | None, strict: bool):
         self.name = name
-        self.declared = reader.declared
+        self.declared, self.folder = reader.declared, reader.folder
         self.fps = fps or reader.fps or DEFAULT_FPS
         self.decoded = 0
         self._reader, self._strict, self._override = reader, strict, fps is not None
@@ -250,7 +252,9 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
     with atomic_path(path) as temporary:
         writer = cv2.VideoWriter()
         with quiet():
-            if not any(writer.open(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, (w, h)) for codec in codecs):
+            if not any(
+                writer.open(str(temporary.absolute()), cv2.VideoWriter.fourcc(*codec), fps, (w, h)) for codec in codecs
+            ):
                 raise VideoError(f"{path}: none of the codecs {', '.join(codecs)} opens; try a name in .mp4 or .avi")
         count = 0
         try:

@@ -47,6 +47,16 @@ def test_a_written_video_reads_back(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]  # no temporary file stays
 
 
+@pytest.mark.parametrize("name", ["10:20:30.mp4", "file:a.mp4", "100%d_%s.mp4", "-a b.mp4", "\u00fcml\u00e4ut #1?.mp4"])
+def test_any_name_opens_from_the_folder_that_it_is_in(tmp_path, monkeypatch, name):
+    write_video(tmp_path / "a.mp4", images(4), 25.0)
+    (tmp_path / "a.mp4").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert grays(open_source(name)) == [0, 1, 2, 3]
+    assert write_video(f"of_{name}", images(3), 25.0) == 3
+    assert grays(open_source(f"of_{name}")) == [0, 1, 2]
+
+
 def test_a_failed_write_leaves_nothing(tmp_path):
     with pytest.raises(VideoError, match="no frames"):
         write_video(tmp_path / "a.mp4", [], 25.0)
