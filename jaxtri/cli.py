@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +13,7 @@ from jaxtri.errors import CameraError, InputError, InputWarning, JaxtriError
 # The rest is imported where it is called: help and a wrong option need not wait for it.
 if TYPE_CHECKING:
     from jaxtri.geometry.camera import Camera
+    from jaxtri.vision.video import FrameSource
 
 
 GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
@@ -142,7 +143,7 @@ def _track(options: Track) -> None:
     with open_source(options.source, fps=options.fps, strict=options.strict) as source:
         if not live:
             spare(options.out, [Path(p) for p in (options.source, options.camera) if p is not None], source.folder)
-        camera = _camera(options, source.size)
+        camera = _camera(options, source)
         how = _how(camera, options)
         if live:
             warm_up(camera, **how)
@@ -193,15 +194,25 @@ def _check(options: Track) -> None:
         raise InputError(f"--out {options.out} is a file: give a folder")
 
 
-def _camera(options: Track, size: tuple[int, int]) -> "Camera":
+def _camera(options: Track, source: "FrameSource") -> "Camera":
     from jaxtri.formats import read_camera
     from jaxtri.geometry.camera import Camera
 
+    w, h = source.size
     if options.camera is not None and options.fov is None:
-        return read_camera(options.camera, width=size[0], height=size[1], scale=options.scale_camera)
+        try:
+            return read_camera(options.camera, width=w, height=h, scale=options.scale_camera)
+        except CameraError as error:
+            if source.turned_deg not in (90, 270):
+                raise
+            said = f"the frames are {w}x{h} because their orientation (EXIF or metadata) turns them by "
+            said += f"{source.turned_deg} degrees: calibrate with the turned pictures, or take the orientation out"
+            raise CameraError(f"{error}; {said}") from error
     if options.camera is not None or options.fov is None:
         raise CameraError("give the intrinsics: --camera FILE, or a guess of the field of view by --fov DEGREES")
-    return Camera.from_fov(options.fov, *size)
+    camera = Camera.from_fov(options.fov, w, h)
+    # The field of view is that of the width; what is stored in pixels that are no squares has another fy.
+    return replace(camera, fy=camera.fx * source.pixel_aspect)
 
 
 def _how(camera: "Camera", options: Track) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from jaxtri.odometry.recorder import Recorder
 from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
 from jaxtri.odometry.slots import Slotted, slotted
-from jaxtri.odometry.start import BasePair, Observations, fill, find, hold
+from jaxtri.odometry.start import BasePair, Observations, fill, find, hold, short_lived, too_slow
 from jaxtri.odometry.structure import Points, keep, no_points
 from jaxtri.trajectory import Trajectory
 
@@ -287,22 +287,23 @@ class Odometry(Archived):
 
     def _try_start(self) -> None:
         """Look for a base pair between the first waiting frame and the newest."""
-        now = self._waiting[-1]
+        now = gone = self._waiting[-1]
         while len(self._waiting) > 1:
             first = self._waiting[0]
             common = first.common(now)
             if common.sum() >= max(self._start.points, self._start.common * first.visible.sum()):
                 break
             # Too little is left of the first frame: wait from a later one.
-            self._passed.append(self._waiting.pop(0))
+            gone = self._waiting.pop(0)
+            self._passed.append(gone)
         if len(self._waiting) < 2:
-            self.reason = f"only {int(now.visible.sum())} features in frame {now.index}, and fewer last"
+            self.reason = short_lived(self._start, gone, now)
             return
         first, common = self._waiting[0], self._waiting[0].common(now)
         width = (self.camera.width or 0) / float(self.camera.focal)
         flow = float(np.median(np.linalg.norm(now.u[common] - first.u[common], axis=1))) / width
         if flow < self._start.flow:
-            self.reason = f"the median flow is {flow:.1%} of the image width, {self._start.flow:.1%} needed"
+            self.reason = too_slow(self._start, flow, first)
             return
         tried, before = self._tried
         if tried != first.index or flow >= AGAIN * before:

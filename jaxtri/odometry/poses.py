@@ -101,11 +101,7 @@ def trajectory(poses: Sequence[FramePose], reason: str) -> Trajectory:
     """
     known = [i for i, p in enumerate(poses) if p.T_camera_world is not None]
     if not known:
-        raise InitialisationError(
-            f"no camera motion was found in {len(poses)} frames: {reason}. A camera that stands still "
-            "or only turns shows no parallax: give a longer sequence with sideways motion, or ask for less "
-            "parallax"
-        )
+        raise InitialisationError(f"no camera motion was found in {len(poses)} frames: {reason}")
     nearest = [known[int(np.argmin(np.abs(np.array(known) - i)))] for i in range(len(poses))]
     T = np.stack([poses[i].T_camera_world for i in nearest])  # pyright: ignore[reportArgumentType, reportCallIssue]
     C = np.stack([poses[i].covariance for i in nearest])  # pyright: ignore[reportArgumentType, reportCallIssue]

@@ -1,5 +1,6 @@
 """Starting: a base pair of two frames, the frames between them filled in, and one frame held."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -91,13 +92,15 @@ def find(settings: Settings, start: StartSettings, frames: list[Observations]) -
     first, last = frames[0], frames[-1]
     common = first.common(last)
     if common.sum() < start.points:
-        return Start(None, f"only {int(common.sum())} tracks are common to two frames, {start.points} are needed")
+        return Start(None, _few(start, first, last))
     threshold = float(settings.epipolar_gate)
     found = hypotheses(
         first.u, last.u, common, settings.sigma, threshold, eight_point=start.eight_point, poselib=start.poselib
     )
     if not found:
-        return Start(None, "no essential matrix fits the tracks")
+        return Start(
+            None, "no essential matrix fits the tracks: the frames show no single rigid scene; check their order"
+        )
     spread = np.linspace(0, len(frames) - 1, BETWEEN + 2).round()[1:-1]
     between = [frames[int(k)] for k in spread if 0 < k < len(frames) - 1]
     rivals = [h for h in found if h.cost < RIVAL_SHARE * found[0].cost + RIVAL_MORE]
@@ -105,10 +108,42 @@ def find(settings: Settings, start: StartSettings, frames: list[Observations]) -
         rivals.sort(key=lambda h: h.cost + _transfer_cost(settings, h, first, last, between))
     best = rivals[0]
     if best.inside.sum() < max(start.points, AGREEING * common.sum()):
-        return Start(None, f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion")
+        agreeing = f"only {int(best.inside.sum())} of {int(common.sum())} tracks agree on one motion"
+        return Start(None, f"{agreeing}: too much of the picture moves, or the calibration is wrong; check it first")
     if not best.parallax_deg >= start.parallax_deg:
-        return Start(None, f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed")
+        seen = f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed"
+        remedy = "give a longer sequence with sideways motion, or ask for less parallax (--min-parallax)"
+        return Start(None, f"{seen}: the camera all but turns on the spot, or the scene is far away; {remedy}")
     return Start(best, "")
+
+
+def too_slow(start: StartSettings, flow: float, first: Observations) -> str:
+    """Why there is no start yet where the picture has hardly moved since `first`."""
+    seen = f"the median flow since frame {first.index} is {flow:.1%} of the image width, {start.flow:.1%} needed"
+    return f"{seen}: the camera stands still or moves slowly; give a longer sequence, in which the flow adds up"
+
+
+def short_lived(start: StartSettings, first: Observations, now: Observations) -> str:
+    """Why there is no start yet where too few tracks last from `first` to `now`."""
+    if first.index == now.index:
+        return "there is only one frame yet"
+    seen = int(now.visible.sum())
+    if seen < start.points:
+        return (
+            f"only {seen} features in frame {now.index}, {start.points} are needed: it is blurred, dark or without "
+            "texture; film with more light and a shorter exposure"
+        )
+    return _few(start, first, now)
+
+
+def _few(start: StartSettings, first: Observations, now: Observations) -> str:
+    had, left = int(first.visible.sum()), int(first.common(now).sum())
+    least = max(start.points, math.ceil(start.common * had))
+    return (
+        f"of {had} features of frame {first.index} {left} are left in frame {now.index}, {least} are needed: the "
+        "picture changes too fast, or has too little contrast; give frames that follow each other more closely, or "
+        "brighter ones"
+    )
 
 
 def _transfer_cost(

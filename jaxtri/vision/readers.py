@@ -1,41 +1,19 @@
 """What `jaxtri.vision.video` reads from: OpenCV's captures and folders of images, one frame at a time."""
 
-import contextlib
-import os
 import time
-from collections.abc import Iterator
+import warnings
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from jaxtri.errors import VideoError
+from jaxtri.errors import SourceWarning, VideoError
+from jaxtri.vision.images import CLOCKWISE, bits_in_use, read_image, turned
 from jaxtri.vision.layouts import lay_out
+from jaxtri.vision.quiet import quiet
 
 Item = tuple[int, float | None, np.ndarray | str]
 """Index, time in seconds if known, and the image, or the reason why it cannot be decoded."""
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Keep OpenCV and FFmpeg from printing what is reported as an error or warning here."""
-    # Where the level lives has changed: `cv2.setLogLevel` in 4, `cv2.utils.logging` in 5.
-    module: Any = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging", None)
-    level = module.getLogLevel() if module else 0
-    # FFmpeg's own level is read from here once, at the first opening of a process.
-    added = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
-    if added:
-        os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
-    try:
-        if module:
-            module.setLogLevel(0)
-        yield
-    finally:
-        if module:
-            module.setLogLevel(level)
-        if added:
-            os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
 
 
 class Capture:
@@ -57,6 +35,12 @@ class Capture:
         # Containers without an index give nonsense (-9e18 for a bare MJPEG stream).
         self.declared = int(count) if not self.live and 0 < count < 1e9 else None
         self.fps = fps if 0 < fps < 1e4 else None
+        # Whether the picture is turned as its metadata say by default differs between versions of OpenCV.
+        upright = not self.live and self.capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        self.turned_deg = round(self.capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 if upright else 0
+        sar = self.capture.get(cv2.CAP_PROP_SAR_NUM), self.capture.get(cv2.CAP_PROP_SAR_DEN)
+        aspect = sar[0] / sar[1] if min(sar) > 0 and not self.live else 1.0
+        self.pixel_aspect = 1 / aspect if self.turned_deg in (90, 270) else aspect
         self.counted = not self.live and _is_counted(Path(str(source)))
 
     def whole(self, decoded: int) -> bool:
@@ -117,6 +101,10 @@ class Folder:
         self.folder: Path | None = found.home
         self.declared: int | None = len(self.files)
         self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
+        self.orientation: int | None = None  # EXIF's, of the first image
+        self.turned_deg, self.pixel_aspect = 0, 1.0
+        self.bits: int | None = None  # in use, of images of 16
+        self.said = False  # that the orientation changes
         self.index = -1
 
     def whole(self, decoded: int) -> bool:
@@ -129,19 +117,31 @@ class Folder:
         if self.index >= len(self.files):
             return None
         time_s = None if self.times is None else self.times[self.index]
-        return self.index, time_s, _read_image(self.files[self.index])
+        found = read_image(self.files[self.index])
+        return self.index, time_s, found if isinstance(found, str) else self._as_first(*found)
+
+    def _as_first(self, image: np.ndarray, orientation: int) -> np.ndarray:
+        """The picture with 8 bits, turned as the first one says."""
+        name = self.files[self.index].name
+        if self.orientation is None:
+            self.orientation, self.turned_deg = orientation, CLOCKWISE[orientation]
+        elif orientation != self.orientation and not self.said:
+            # A camera writes which way is up as its gravity sensor sees it; its pixels stay those of one sensor.
+            self.said = True
+            warnings.warn(
+                f"{name}: the EXIF orientation changes from {self.orientation} to {orientation} here; all images are "
+                "turned as the first one says",
+                SourceWarning,
+                stacklevel=2,
+            )
+        if image.dtype == np.uint16:
+            if self.bits is None:
+                self.bits = bits_in_use(self.files)
+                if self.bits < 16:
+                    message = f"{name}: these images of 16 bits use only {self.bits} bits, and are read as such"
+                    warnings.warn(message, SourceWarning, stacklevel=2)
+            image = np.minimum(image >> (self.bits - 8), 255).astype(np.uint8)
+        return turned(image, self.orientation)
 
     def close(self) -> None:
         """Nothing is held open between images."""
-
-
-def _read_image(path: Path) -> np.ndarray | str:
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        return f"{path.name} cannot be read ({error.strerror})"
-    # OpenCV 4 fills up a JPEG that was cut off; what is missing then is the end-of-image marker.
-    whole = data.size > 0 and (data[:2].tobytes() != b"\xff\xd8" or b"\xff\xd9" in data.tobytes())
-    with quiet():
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if whole else None
-    return f"{path.name} is not a readable image" if image is None else image

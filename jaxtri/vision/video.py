@@ -17,8 +17,10 @@ from jaxtyping import UInt8
 
 from jaxtri.errors import ResolutionChangeError, SourceWarning, TruncatedVideoError, TruncatedVideoWarning, VideoError
 from jaxtri.formats import atomic_path
+from jaxtri.vision import interlaced
 from jaxtri.vision.layouts import IMAGE_SUFFIXES
-from jaxtri.vision.readers import Capture, Folder, Item, quiet
+from jaxtri.vision.quiet import quiet
+from jaxtri.vision.readers import Capture, Folder, Item
 
 DEFAULT_FPS = 25.0
 """Frames a second of a source that has no clock of its own and was given none."""
@@ -44,6 +46,8 @@ class _Reader(Protocol):
     declared: int | None
     fps: float | None
     folder: Path | None
+    turned_deg: int
+    pixel_aspect: float
     numbers: list[int] | None
 
     def read(self) -> Item | None:
@@ -61,7 +65,8 @@ class FrameSource:
     """The frames of a video, folder or camera: a one-pass iterator of `Frame` and a context manager.
 
     Times increase strictly: a time that does not is replaced by the last one plus a frame. Gray and 16-bit images
-    come as 8-bit BGR. Build one with `open_source`, which documents the errors.
+    come as 8-bit BGR, scaled by the bits that the source uses; pictures are turned upright by the first one's
+    orientation. Build one with `open_source`, which documents the errors.
 
     Attributes:
         name: What the source is called in messages.
@@ -70,6 +75,8 @@ class FrameSource:
             MPEG) claim their duration times the rate.
         folder: Folder that holds the images, None for a video.
         fps: Nominal frames a second; `DEFAULT_FPS` where neither source nor caller says.
+        turned_deg: Degrees clockwise by which the stored pixels are turned, as their metadata or EXIF orientation says.
+        pixel_aspect: Width of a pixel over its height, as the metadata say; the images are not resized.
         decoded: Frames handed out so far.
     """
 
@@ -79,7 +86,7 @@ class FrameSource:
         self.fps = fps or reader.fps or DEFAULT_FPS
         self.decoded = 0
         self._reader, self._strict, self._override = reader, strict, fps is not None
-        self._timed = fps is not None or reader.fps is not None or isinstance(reader, Capture)
+        self._timed = fps is not None or reader.fps is not None or not isinstance(reader, Folder)
         self._time = -math.inf
         self._bad: list[str] = []
         self._ended = False
@@ -93,6 +100,21 @@ class FrameSource:
             reader.close()
             raise VideoError(f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1]))
         self.size = _size(self._first)
+        self.turned_deg, self.pixel_aspect = reader.turned_deg, reader.pixel_aspect
+        if self.turned_deg:
+            warnings.warn(
+                f"{name}: the pixels are turned by {self.turned_deg} degrees, as their orientation (EXIF or metadata) "
+                "says; the calibration must be that of the turned picture",
+                SourceWarning,
+                stacklevel=3,
+            )
+        if isinstance(reader, Capture) and not reader.live and np.ptp(self._first.image) == 0:
+            warnings.warn(
+                f"{name}: the first frame is of one colour. If the film is interlaced, OpenCV may not decode it: "
+                "install jaxtri[video], or deinterlace it by ffmpeg -i FILE -vf yadif new.mp4",
+                SourceWarning,
+                stacklevel=3,
+            )
         if not self._timed:
             warnings.warn(
                 f"{name}: no list of times and no names of images say when they were taken: {DEFAULT_FPS:g} frames a "
@@ -187,7 +209,7 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
         raise VideoError(f"{text}: no such file or folder")
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise VideoError(f"{text} is a single image; give the folder of the frames")
-    return FrameSource(text, Capture(text, text), fps, strict)
+    return FrameSource(text, interlaced.reader(path) or Capture(text, text), fps, strict)
 
 
 def ahead(frames: Iterable[Frame], depth: int = 4) -> Generator[Frame, None, None]:
@@ -275,8 +297,6 @@ def _size(frame: Frame) -> tuple[int, int]:
 
 
 def _bgr8(image: np.ndarray) -> np.ndarray:
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
     if image.ndim == 2 or image.shape[2] == 1:
         return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
     return np.ascontiguousarray(image[..., :3])

@@ -10,7 +10,7 @@ from jaxtri.errors import ResolutionChangeError, TruncatedVideoError, TruncatedV
 from jaxtri.vision.video import Frame, ahead, open_source, spool, write_video
 
 # Most of the folders here have no times; `test_layouts.py` is about those.
-pytestmark = pytest.mark.filterwarnings("ignore:.*frames a second are assumed")
+pytestmark = pytest.mark.filterwarnings("ignore:.*(frames a second are assumed|of one colour)")
 
 
 def images(count, size=(64, 48)):

@@ -1,0 +1,56 @@
+"""Why there is no start: each reason says what was seen and a remedy, and is given only where it holds."""
+
+import numpy as np
+import pytest
+
+from jaxtri import Camera, Odometry
+from jaxtri.errors import InitialisationError
+
+RNG = np.random.default_rng(0)
+CAMERA = Camera.from_parameters(280, 280, 159.5, 119.5, width=320, height=240)
+
+
+def why(frames, ids):
+    """The message of a run over (n, 2) pixels a frame, with the numbers of their tracks."""
+    odometry = Odometry(CAMERA, capacity=512)
+    for k, (pixels, numbers) in enumerate(zip(frames, ids, strict=True)):
+        odometry.add(pixels, np.ones(len(pixels), bool), float(k), ids=numbers)
+    with pytest.raises(InitialisationError) as raised:
+        odometry.trajectory()
+    message = str(raised.value)
+    assert message.startswith(f"no camera motion was found in {len(frames)} frames: ")
+    return message
+
+
+def points(n):
+    return RNG.uniform([10, 10], [310, 230], (n, 2))
+
+
+def test_few_features_are_called_few():
+    message = why([points(12)] * 4, [np.arange(12)] * 4)
+    assert "only 12 features in frame 3, 20 are needed" in message
+    assert "less parallax" not in message
+
+
+def test_many_features_that_do_not_last_are_not_called_few():
+    message = why([points(300) for _ in range(4)], [300 * k + np.arange(300) for k in range(4)])
+    assert "only" not in message
+    assert "of 300 features of frame 2 0 are left in frame 3, 45 are needed" in message
+    assert "less parallax" not in message
+
+
+def test_a_camera_that_hardly_moves_is_not_told_to_ask_for_less_parallax():
+    still = points(300)
+    message = why([still + 0.5 * k for k in range(4)], [np.arange(300)] * 4)
+    assert "median flow since frame 0 is 0.7% of the image width, 3.5% needed" in message
+    assert "longer sequence" in message
+    assert "less parallax" not in message
+
+
+def test_less_parallax_is_advised_where_parallax_is_short():
+    a, u, frames = np.radians(1.0), np.column_stack([(points(300) - [159.5, 119.5]) / 280, np.ones(300)]), []
+    for k in range(8):  # the camera only turns
+        R = np.array([[np.cos(k * a), 0, np.sin(k * a)], [0, 1, 0], [-np.sin(k * a), 0, np.cos(k * a)]])
+        x = u @ R.T
+        frames.append(280 * x[:, :2] / x[:, 2:] + np.array([159.5, 119.5]) + RNG.normal(0, 0.2, (300, 2)))
+    assert "--min-parallax" in why(frames, [np.arange(300)] * 8)
