@@ -42,6 +42,8 @@ class Track:
     """Standard deviation of a tracked point, pixels."""
     calibration_error: float | None = None
     """What the focal length may be off by, as a share of it (0.003; 0.05 with `--fov`): it is in the covariances."""
+    mask: Path | None = None
+    """Picture, or folder of one a frame, of the frames' size: what is white (a logo, the bonnet) is ignored."""
     features: int = 800
     """Features followed at once."""
     min_parallax: float | None = None
@@ -140,9 +142,10 @@ def _track(options: Track) -> None:
     live = options.source.isdecimal() and not Path(options.source).exists()
     if live and options.max_frames is None:
         print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
-    with open_source(options.source, fps=options.fps, strict=options.strict) as source:
+    with open_source(options.source, fps=options.fps, strict=options.strict, mask=options.mask) as source:
         if not live:
-            spare(options.out, [Path(p) for p in (options.source, options.camera) if p is not None], source.folder)
+            read = (options.source, options.camera, options.mask)
+            spare(options.out, [Path(p) for p in read if p is not None], source.folder)
         camera = _camera(options, source)
         how = _how(camera, options)
         if live:

@@ -175,9 +175,9 @@ def _followed(
 ) -> Generator[tuple[Frame, FrameTracks], None, None]:
     """Every frame with its tracks, the next one followed already; `given_up` are the outliers of the one before."""
 
-    def follow(image: np.ndarray) -> FrameTracks:
+    def follow(frame: Frame) -> FrameTracks:
         with clock.part("optical flow"):
-            return features.track(image)
+            return features.track(frame.image, frame.ignore)
 
     with contextlib.closing(ahead(source)) as frames, ThreadPoolExecutor(1) as pool:
 
@@ -187,7 +187,7 @@ def _followed(
             if frame is None:
                 return None
             _same_size(camera, frame)
-            return frame, pool.submit(follow, frame.image)
+            return frame, pool.submit(follow, frame)
 
         now = following()
         while now is not None:

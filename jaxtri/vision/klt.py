@@ -101,9 +101,12 @@ class KLT:
         self._frame = -1
         self._next_id = 0
         self._shape: tuple[int, ...] | None = None
+        self._ignore: tuple[np.ndarray | None, np.ndarray | None] = None, None  # as given, and with its surroundings
 
-    def track(self, image: np.ndarray) -> FrameTracks:
+    def track(self, image: np.ndarray, ignore: np.ndarray | None = None) -> FrameTracks:
         """Follow all features into `image` (h, w) or (h, w, 3) uint8, and fill the free slots.
+
+        Where `ignore` (h, w) is True, and half a patch around, there are none.
 
         Raises `ResolutionChangeError` when the image is not of the first one's size.
         """
@@ -124,6 +127,9 @@ class KLT:
             self._alive[slots] = ok
             self._realign(gray, error, eigenvalue)
             self._separate()
+        if ignore is not self._ignore[0]:
+            self._ignore = ignore, self._around(ignore)
+        self._alive &= ~self._ignored()
         fresh = np.zeros(self.settings.capacity, bool)
         if self._alive.sum() < self.settings.refill * self.settings.capacity:
             fresh = self._fill(gray)
@@ -210,6 +216,22 @@ class KLT:
         margin = self.settings.window // 4
         return np.all((pixels >= margin) & (pixels < np.array([w, h]) - margin), axis=1)
 
+    def _around(self, ignore: np.ndarray | None) -> np.ndarray | None:
+        """What is ignored (h, w), and half a patch around: a patch that holds some of it follows that, too."""
+        if ignore is None:
+            return None
+        if ignore.shape != self._shape:
+            raise ResolutionChangeError(f"ignore is of shape {ignore.shape}, the image of {self._shape}")
+        return cv2.dilate(ignore.astype(np.uint8), np.ones((self.settings.window | 1,) * 2, np.uint8)).astype(bool)
+
+    def _ignored(self) -> np.ndarray:
+        """The slots (n,) whose feature lies in what is ignored."""
+        if self._ignore[1] is None or self._shape is None:
+            return np.zeros(len(self._alive), bool)
+        x, y = np.rint(self._pixels).astype(int).T
+        h, w = self._shape[:2]
+        return self._ignore[1][y.clip(0, h - 1), x.clip(0, w - 1)]
+
     def _separate(self) -> None:
         """Give up features that have run into an older one."""
         slots = np.flatnonzero(self._alive)
@@ -225,6 +247,8 @@ class KLT:
     def _fill(self, gray: np.ndarray) -> np.ndarray:
         s = self.settings
         mask = np.full(gray.shape[:2], 255, np.uint8)
+        if self._ignore[1] is not None:
+            mask[self._ignore[1]] = 0
         for x, y in self._pixels[self._alive]:
             cv2.circle(mask, (round(float(x)), round(float(y))), int(s.spacing), 0, -1)
         corners = cv2.goodFeaturesToTrack(

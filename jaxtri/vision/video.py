@@ -5,7 +5,7 @@ import math
 import os
 import warnings
 from collections.abc import Generator, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Thread
@@ -13,12 +13,13 @@ from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from jaxtri.errors import ResolutionChangeError, SourceWarning, TruncatedVideoError, TruncatedVideoWarning, VideoError
 from jaxtri.formats import atomic_path
 from jaxtri.vision import interlaced
 from jaxtri.vision.layouts import IMAGE_SUFFIXES
+from jaxtri.vision.masks import Masks
 from jaxtri.vision.quiet import quiet
 from jaxtri.vision.readers import Capture, Folder, Item
 
@@ -34,11 +35,13 @@ class Frame:
         index: Place in the source, from 0; a frame that cannot be decoded is skipped, its number is not.
         time_s: Seconds.
         image: (h, w, 3) uint8, BGR.
+        ignore: (h, w) where no features are looked for; None for nowhere.
     """
 
     index: int
     time_s: float
     image: UInt8[np.ndarray, "h w 3"]
+    ignore: Bool[np.ndarray, "h w"] | None = None
 
 
 @runtime_checkable
@@ -90,6 +93,7 @@ class FrameSource:
         self._time = -math.inf
         self._bad: list[str] = []
         self._ended = False
+        self._masks: Masks | None = None
         # The first frame is decoded here, so that a source without any fails on opening.
         try:
             self._first = self._read()
@@ -157,7 +161,11 @@ class FrameSource:
                 f"{self.size[0]}x{self.size[1]}; split the source where the size changes"
             )
         self.decoded += 1
-        return frame
+        return frame if self._masks is None else replace(frame, ignore=self._masks.of(frame.index))
+
+    def ignore(self, mask: Path) -> None:
+        """Ignore what is white in a picture, or in each frame's own of a folder. Raises `VideoError`: see `Masks`."""
+        self._masks = Masks(mask, self.size, None if self.folder is None else self.declared)
 
     def _finish(self) -> None:
         self.close()
@@ -180,7 +188,13 @@ class FrameSource:
         self.close()
 
 
-def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = None, strict: bool = False) -> FrameSource:
+def open_source(
+    source: str | os.PathLike[str] | int,
+    *,
+    fps: float | None = None,
+    strict: bool = False,
+    mask: str | os.PathLike[str] | None = None,
+) -> FrameSource:
     """Open a video file, a folder of images, or a camera by its number (an integer or, say, "0").
 
     A folder gives its images in natural order ("2" before "10", but .05 before .1), or those below it as data sets have
@@ -189,9 +203,10 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
     dates, then optionally the file's name, a line a frame), or else from the names of the files, if they are seconds
     or nanoseconds. Numbered files are `fps` apart, a missing number counts as a frame; where nothing says the rate, a
     `SourceWarning` says which is assumed. `fps` overrides the times of any source. A camera's times count from its
-    first frame, by the clock of this computer.
+    first frame, by the clock of this computer. `mask` is a picture, or a folder of one a frame, of the frames' size:
+    what is white in it shows no features (an overlay, a bonnet, what moves).
 
-    Raises VideoError if there is nothing to read, the file is no video, or the time stamps do not fit the
+    Raises VideoError if there is nothing to read, the file is no video, or the time stamps or masks do not fit the
     images; ResolutionChangeError, while iterating, if the frame size changes (OpenCV's FFmpeg reader hides
     such a change by rescaling; there it goes unseen). A frame that cannot be decoded is skipped. Where
     frames are missing, or the source ends early, one TruncatedVideoWarning at the end says how many were decoded of how
@@ -199,6 +214,17 @@ def open_source(source: str | os.PathLike[str] | int, *, fps: float | None = Non
     """
     if fps is not None and not (math.isfinite(fps) and fps > 0):
         raise VideoError(f"fps is {fps}; give frames a second as a positive number")
+    found = _opened(source, fps, strict)
+    if mask is not None:
+        try:
+            found.ignore(Path(mask))
+        except VideoError:
+            found.close()
+            raise
+    return found
+
+
+def _opened(source: str | os.PathLike[str] | int, fps: float | None, strict: bool) -> FrameSource:
     text = str(source)
     path = Path(text)
     if isinstance(source, int) or (text.isdecimal() and not path.exists()):

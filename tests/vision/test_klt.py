@@ -51,6 +51,26 @@ def test_features_are_followed_where_the_image_jumps(shift):
     assert np.percentile(np.linalg.norm(second.pixels - there, axis=1)[kept], 95) < 0.5
 
 
+def test_no_feature_is_kept_or_found_where_the_image_is_ignored():
+    image, klt = texture(), KLT(SETTINGS)
+    logo = np.zeros(image.shape, bool)
+    logo[100:200, 150:300] = True
+    reach = SETTINGS.window // 2
+
+    def inside(tracks):
+        x, y = tracks.pixels[tracks.visible].T
+        return (x > 150 - reach) & (x < 299 + reach) & (y > 100 - reach) & (y < 199 + reach)
+
+    # Put on a picture, it takes the features that are there; the camera moves, and none comes in.
+    assert inside(klt.track(image)).sum() > 10
+    for k in range(1, 6):
+        tracks = klt.track(moved(image, (6.0 * k, 0.0)), logo)
+        assert tracks.visible.sum() > 80
+        assert not inside(tracks).any()
+    with pytest.raises(ResolutionChangeError, match="ignore is of shape"):
+        klt.track(image, logo.T.copy())
+
+
 def test_slots_ids_and_births():
     image, klt = texture(), KLT(SETTINGS)
     before = klt.track(image)
