@@ -1,12 +1,13 @@
 """Calibration files in and out: a camera of the images' size, whose numbers can be."""
 
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from jaxtri.errors import CameraError
+from jaxtri.errors import CameraError, InputWarning
 from jaxtri.formats.calibrations import Cameras, cameras
 from jaxtri.formats.entries import Entries
 from jaxtri.formats.files import PathLike, read_text, write_json
@@ -18,6 +19,7 @@ from jaxtri.geometry.lenses import BrownConrady
 # Least focal length as a share of the larger side: 157 degrees for a straight line to stay one, and less than any
 # fisheye that sees all around it.
 _LEAST, _LEAST_WIDE = 0.1, 0.05
+_NEAR = 0.1  # share of a side up to which a principal point before its edge is counted from the middle
 _UNLIKE = 3  # fx over fy: a field of an anamorphic video has 2.9
 
 
@@ -126,12 +128,18 @@ def _check(c: Intrinsics) -> None:
         )
     if not 1 / _UNLIKE < c.fx / c.fy < _UNLIKE:
         raise CameraError(f"fx is {c.fx:g}, but fy {c.fy:g}: no pixels are so oblong; is one mistyped?")
-    outside = [n for n, x, s in (("cx", c.cx, w), ("cy", c.cy, h)) if s and not -0.5 <= x <= s - 0.5]
+    outside = [(n, x / s) for n, x, s in (("cx", c.cx, w), ("cy", c.cy, h)) if s and not -0.5 <= x <= s - 0.5]
     if outside:
-        raise CameraError(
-            f"{outside[0]} is {getattr(c, outside[0]):g}: the principal point ({c.cx:g}, {c.cy:g}) lies outside the "
-            f"image of {w}x{h}; is it a calibration of another size?"
-        )
+        (name, share), *_ = outside
+        centre = f"the principal point ({c.cx:g}, {c.cy:g}) lies outside the image of {w}x{h}"
+        seen = f"{name} is {getattr(c, name):g}: {centre}"
+        if all(share < -_NEAR for _, share in outside):
+            # Neither another size nor another origin puts it there: a part cut out of a larger picture may.
+            warnings.warn(f"{seen}, as of a part that was cut out of a larger picture", InputWarning, stacklevel=4)
+        elif share < 0:
+            raise CameraError(f"{seen}; is it counted from the middle of the image? add half of its size")
+        else:
+            raise CameraError(f"{seen}; is it a calibration of another size?")
     if w and h and c.cx == 0 == c.cy:
         raise CameraError(
             "cx and cy are 0: the principal point is counted from the corner of the image, not its middle"

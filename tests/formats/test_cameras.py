@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxtri import formats
-from jaxtri.errors import CameraError
+from jaxtri.errors import CameraError, InputWarning
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.lenses import BrownConrady, DoubleSphere, ExtendedUnified, FieldOfView, Fisheye
 
@@ -411,7 +411,7 @@ def test_of_several_cameras_one_is_chosen(tmp_path):
         ({"fx": 4.1, "fy": 4.1, "cx": 320, "cy": 240}, "fx is 4.1 .*millimetres"),
         (GOOD | {"fx": 24, "fy": 24}, "fx is 24 .*millimetres"),
         (GOOD | {"cx": 660}, "cx is 660.*another size"),
-        (GOOD | {"cy": -3}, "cy is -3.*another size"),
+        (GOOD | {"cy": -3}, "cy is -3.*from the middle"),
         (GOOD | {"fy": 51}, "fx is 500, but fy 51|fy 51"),
         (GOOD | {"cx": 0, "cy": 0}, "cx and cy are 0"),
         ({"camera_matrix": [[500, 0, 0], [0, 510, 0], [320, 240, 1]]}, "camera_matrix .*transpose"),
@@ -436,6 +436,12 @@ def test_what_is_not_understood_or_cannot_be_is_named(tmp_path, text, message):
 def test_rare_cameras_and_entries_of_other_things_pass(tmp_path, change):
     camera = formats.read_camera(write(tmp_path / "c.json", GOOD | change))
     assert float(camera.fx) == (GOOD | change)["fx"]
+
+
+def test_a_principal_point_far_before_the_image_is_of_a_part_cut_out(tmp_path):
+    with pytest.warns(InputWarning, match=r"cy is -1070.*outside the image of 640x480, as of a part"):
+        camera = formats.read_camera(write(tmp_path / "c.json", GOOD | {"cy": -1070.5}))
+    assert float(camera.cy) == -1070.5
 
 
 def test_another_size_is_scaled_where_that_is_asked_for(tmp_path):
