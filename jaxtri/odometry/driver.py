@@ -28,7 +28,7 @@ from jaxtri.odometry.recorder import Recorder
 from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
 from jaxtri.odometry.slots import Slotted, slotted
-from jaxtri.odometry.start import BasePair, Observations, fill, find, hold, short_lived, too_slow
+from jaxtri.odometry.start import BasePair, Observations, Start, fill, find, hold, short_lived, too_slow
 from jaxtri.odometry.structure import Points, keep, no_points
 from jaxtri.trajectory import Trajectory
 
@@ -94,7 +94,7 @@ class Odometry(Archived):
     _passed: list[Observations] = field(default_factory=list, init=False, repr=False)  # no longer can
     _queue: list[Observations] = field(default_factory=list, init=False, repr=False)  # are not taken in yet
     _seeking: bool = field(default=False, init=False, repr=False)  # a base pair: the first and last of those waiting
-    _search: Future[_Begun | str] | None = field(default=None, init=False, repr=False, metadata={"saved": False})
+    _search: Future[_Begun | Start] | None = field(default=None, init=False, repr=False, metadata={"saved": False})
     _follower: Follower | None = field(default=None, init=False, repr=False)
     _points: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
     _tried: tuple[int, float] = field(default=(-1, 0.0), init=False, repr=False)  # first frame and flow of an attempt
@@ -302,19 +302,19 @@ class Odometry(Archived):
         first, common = self._waiting[0], self._waiting[0].common(now)
         width = (self.camera.width or 0) / float(self.camera.focal)
         flow = float(np.median(np.linalg.norm(now.u[common] - first.u[common], axis=1))) / width
-        if flow < self._start.flow:
-            self.reason = too_slow(self._start, flow, first)
-            return
         tried, before = self._tried
+        if flow < self._start.flow:
+            self.reason = self.reason if tried == first.index else too_slow(self._start, flow, first)
+            return
         if tried != first.index or flow >= AGAIN * before:
             self._tried, self._seeking = (first.index, flow), True
 
-    def _begin_beside(self) -> Future[_Begun | str]:
+    def _begin_beside(self) -> Future[_Begun | Start]:
         """`_begin` in a thread of its own."""
         # What a `with` has set in JAX holds for the thread that says so alone.
         x64, device = jax.enable_x64.value, jax.default_device.value
 
-        def begin() -> _Begun | str:
+        def begin() -> _Begun | Start:
             with jax.enable_x64(x64), jax.default_device(device):
                 return self._begin()
 
@@ -323,11 +323,14 @@ class Odometry(Archived):
         pool.shutdown(wait=False)
         return search
 
-    def _settle(self, begun: _Begun | str) -> None:
+    def _settle(self, begun: _Begun | Start) -> None:
         """Go on from a start that was worked out beside, or without one."""
         self._search, self._seeking = None, False
-        if isinstance(begun, str):
-            self.reason = begun
+        if isinstance(begun, Start):
+            self.reason = begun.reason
+            if begun.over:
+                *gone, last = self._waiting
+                self._tried, self._passed, self._waiting = (last.index, 0.0), self._passed + gone, [last]
             return
         for index, pose in begun.poses.items():
             self.poses[index] = pose
@@ -340,27 +343,25 @@ class Odometry(Archived):
         self.starts += 1
         self._waiting, self._passed = [], []
 
-    def _begin(self) -> _Begun | str:
+    def _begin(self) -> _Begun | Start:
         """The filter from a base pair of waiting frames, those between and before filled in; or why it has to wait.
 
         Other frames are queued meanwhile, so it only reads, and only what they do not change.
         """
-        frames = self._waiting
-        searched = find(self._settings, self._start, frames)
+        frames, searched = self._waiting, find(self._settings, self._start, self._waiting)
         if searched.found is None:
-            return searched.reason
+            return searched
         pose = searched.found.pose
         first, last = frames[0], frames[-1]
-        again = self.starts > 0
         world = identity(pose.translation.dtype)
-        if again:
+        if self.starts:
             held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
             world = SE3.from_matrix(jnp.asarray(held, pose.translation.dtype))
             state, _ = fill(self._settings, [first, last], pose, world, [1.0])
             pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
         state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
         noise = float(reports[0][1].noise)
-        status = Status.RESTARTED if again else Status.TRACKING
+        status = Status.RESTARTED if self.starts else Status.TRACKING
         poses = {first.index: FramePose(first.time, status, pose_matrix(world), np.zeros((6, 6)))}
         reports = [*reports, *self._backwards(first, state, world)]
         poses |= {f.index: FramePose.of(f.time, report) for f, report in reports}

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
 
+from jaxtri.estimation import zoom
 from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.pose import compose, identity
 from jaxtri.odometry import track_pairs
 from jaxtri.odometry.settings import Report, Settings, StartSettings
-from jaxtri.vision.hypotheses import Hypothesis, hypotheses
+from jaxtri.vision.hypotheses import GATE, Hypothesis, hypotheses
 
 # Hypotheses up to RIVAL_SHARE times the cost of the best, and RIVAL_MORE, explain the pair about equally well. Before a
 # plane the two poses cost the same; the margin keeps noise from deciding between them.
@@ -57,10 +58,12 @@ class Start(NamedTuple):
     Attributes:
         found: The relative pose of the pair, None where there is none yet.
         reason: Why there is none, for a person to read; empty where there is one.
+        over: Whether a pair from its first frame shows no motion at all, so that it is better sought from the last.
     """
 
     found: Hypothesis | None
     reason: str
+    over: bool = False
 
 
 class BasePair(NamedTuple):
@@ -114,6 +117,11 @@ def find(settings: Settings, start: StartSettings, frames: list[Observations]) -
         seen = f"the parallax is {best.parallax_deg:.2f} degrees, {start.parallax_deg:g} are needed"
         remedy = "give a longer sequence with sideways motion, or ask for less parallax (--min-parallax)"
         return Start(None, f"{seen}: the camera all but turns on the spot, or the scene is far away; {remedy}")
+    if not start.eight_point:  # the paper's way, two frames in a row, knows no such doubt
+        arrays = (jnp.asarray(x) for x in (first.u, last.u, common))
+        turned = zoom.fit(*arrays, settings.sigma)
+        if zoom.explains(turned, common, best.cost, GATE**2):
+            return Start(None, _zoomed(float(turned.scale)), over=True)
     return Start(best, "")
 
 
@@ -143,6 +151,14 @@ def _few(start: StartSettings, first: Observations, now: Observations) -> str:
         f"of {had} features of frame {first.index} {left} are left in frame {now.index}, {least} are needed: the "
         "picture changes too fast, or has too little contrast; give frames that follow each other more closely, or "
         "brighter ones"
+    )
+
+
+def _zoomed(scale: float) -> str:
+    return (
+        f"the picture only turns, and grows {scale:.3g} times, as of a lens that zooms, or of a camera that moves "
+        "straight towards a flat scene: neither shows depth; cut the clip where the zoom ends, or give one with "
+        "sideways motion"
     )
 
 

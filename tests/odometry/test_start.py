@@ -54,3 +54,26 @@ def test_less_parallax_is_advised_where_parallax_is_short():
         x = u @ R.T
         frames.append(280 * x[:, :2] / x[:, 2:] + np.array([159.5, 119.5]) + RNG.normal(0, 0.2, (300, 2)))
     assert "--min-parallax" in why(frames, [np.arange(300)] * 8)
+
+
+def test_a_zoom_on_a_tripod_is_no_motion():
+    still, frames = points(300), []
+    for k in range(30):
+        frames.append((still - [159.5, 119.5]) * 1.015**k + [159.5, 119.5] + RNG.normal(0, 0.2, (300, 2)))
+    message = why(frames, [np.arange(300)] * 30)
+    assert "zoom" in message
+    assert "less parallax" not in message
+
+
+def test_a_motion_after_a_zoom_is_found():
+    u, frames = np.column_stack([(points(300) - [159.5, 119.5]) / 280, np.ones(300)]), []
+    X = u * RNG.uniform(2, 4, (300, 1))
+    for k in range(24):
+        f, Y = 280 * 1.015 ** min(k, 12), X - np.array([0.03 * max(k - 12, 0), 0.0, 0.0])
+        frames.append(f * Y[:, :2] / Y[:, 2:] + [159.5, 119.5] + RNG.normal(0, 0.2, (300, 2)))
+    odometry = Odometry(CAMERA, capacity=512)
+    for k, pixels in enumerate(frames):
+        odometry.add(pixels, np.ones(300, bool), float(k), ids=np.arange(300))
+    odometry.finish()
+    assert odometry.base_pair is not None
+    assert odometry.base_pair[0] > 0  # the pairs of the first frame only zoom
