@@ -115,10 +115,10 @@ def refine(
         return jax.vmap(lambda a, b: sampson(E, a, b))(u1, u2) / sigma * valid
 
     def residuals(x: Float[Array, "5"], _: None) -> Array:
-        r = huberised(distances(x), huber)
+        r = _huberised(distances(x), huber)
         return r if root is None else jnp.concatenate([r, root @ x])
 
-    x, successful = least_squares(residuals, jnp.zeros(5, dtype), max_steps)
+    x, successful = _least_squares(residuals, jnp.zeros(5, dtype), max_steps)
     J = jax.jacfwd(lambda y: residuals(y, None))(x)
     inside = _inverse(J.T @ J)
     T, R = pose(x)
@@ -147,14 +147,14 @@ def _root_of_information(
     return jax.scipy.linalg.solve_triangular(scaled, jnp.diag(1 / s), lower=True)
 
 
-def huberised(d: Float[Array, "*n"], huber: float) -> Float[Array, "*n"]:
+def _huberised(d: Float[Array, " n"], huber: float) -> Float[Array, " n"]:
     """Root of twice the Huber loss, so that least squares minimises it."""
     large = jnp.abs(d) > huber
     safe = jnp.where(large, jnp.abs(d), huber)
     return jnp.where(large, jnp.sign(d) * jnp.sqrt(2 * huber * safe - huber**2), d)
 
 
-def least_squares(
+def _least_squares(
     residuals: Callable[[Array, None], Array], first: Float[Array, " d"], max_steps: int
 ) -> tuple[Float[Array, " d"], Bool[Array, ""]]:
     """The minimum, with its derivatives, and whether it was reached."""

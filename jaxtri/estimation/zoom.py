@@ -1,18 +1,16 @@
-"""Two views of a camera that stays where it is, turns, and changes its focal length; it must not pass for a motion."""
+"""Two views of a camera that stays where it is, turns, and changes its focal length; it must not pass for a motion.
+
+On the host, by SciPy: it is asked for once a start, and compiling it would take longer than all starts of a run.
+"""
 
 import math
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxlie import SO3
-from jaxtyping import Array, Bool, Float
-
-from jaxtri.estimation.two_view import huberised, least_squares
-from jaxtri.filters.masks import stand_in
+import numpy as np
+from jaxtyping import Bool, Float
 
 DEPTH = math.log(4)  # what GRIC charges a model for each point that it gives a depth
-HUBER, STEPS = 2.0, 32
+HUBER = 2.0  # sigmas from which an error counts linearly
 NEAREST = 1e-3  # cosine of a turned ray's angle to the axis, below which it is held there: 89.9 degrees
 
 
@@ -20,45 +18,39 @@ class Zoom(NamedTuple):
     """A turn and a zoom between two views: u2 = scale R u1.
 
     Attributes:
-        rotation: R.
+        turn: (3,) rotation vector of R, radians.
         scale: Focal length in the second view over that in the first.
-        distance: (n,) squared distances of the points in both views, over sigma squared, as Sampson's is.
+        distance: (m,) squared distances of the points in both views, over sigma squared, as Sampson's is.
     """
 
-    rotation: SO3
-    scale: Float[Array, ""]
-    distance: Float[Array, " n"]
+    turn: Float[np.ndarray, "3"]
+    scale: float
+    distance: Float[np.ndarray, " m"]
 
 
-@jax.jit
-def fit(u1: Float[Array, "n 2"], u2: Float[Array, "n 2"], mask: Bool[Array, " n"], sigma: Float[Array, ""]) -> Zoom:
-    """The turn and zoom that two views of the points in the mask agree on best; `u1`, `u2` are normalised."""
-    u1, u2 = stand_in(mask, (u1, u2))
+def fit(u1: Float[np.ndarray, "n 2"], u2: Float[np.ndarray, "n 2"], mask: Bool[np.ndarray, " n"], sigma: float) -> Zoom:
+    """The turn and zoom that two views of the m points in the mask agree on best; `u1`, `u2` are normalised."""
+    from scipy.optimize import least_squares  # here: importing it takes longer than a start
+    from scipy.spatial.transform import Rotation
 
-    def residuals(x: Float[Array, "4"]) -> Float[Array, "n 2"]:
-        y = jnp.concatenate([u1, jnp.ones_like(u1[:, :1])], axis=1) @ SO3.exp(x[:3]).as_matrix().T
-        depth = jnp.where(y[:, 2] > NEAREST, y[:, 2], NEAREST)
-        return (jnp.exp(x[3]) * y[:, :2] / depth[:, None] - u2) / sigma
+    rays, seen = np.column_stack([u1[mask], np.ones(mask.sum())]), u2[mask]
 
-    def robust(x: Float[Array, "4"], _: None) -> Array:
-        return jnp.where(mask[:, None], huberised(residuals(x), HUBER), 0.0).ravel()
+    def residuals(x: np.ndarray) -> np.ndarray:
+        y = rays @ Rotation.from_rotvec(x[:3]).as_matrix().T
+        return ((math.exp(x[3]) * y[:, :2] / np.maximum(y[:, 2:], NEAREST) - seen) / sigma).ravel()
 
-    x, _ = least_squares(robust, jnp.zeros(4, u1.dtype), STEPS)
-    scale = jnp.exp(x[3])
+    x = least_squares(residuals, np.zeros(4), loss="huber", f_scale=HUBER).x
+    scale = math.exp(x[3])
     # The first view's noise comes over enlarged.
-    return Zoom(SO3.exp(x[:3]), scale, jnp.sum(residuals(x) ** 2, axis=1) / (1 + scale**2))
+    return Zoom(x[:3], scale, np.sum(residuals(x).reshape(-1, 2) ** 2, axis=1) / (1 + scale**2))
 
 
-@jax.jit
-def explains(
-    zoom: Zoom, mask: Bool[Array, " n"], rival: Float[Array, ""] | float, worst: Float[Array, ""] | float
-) -> Bool[Array, ""]:
-    """Whether it explains the points in the mask as well as a motion whose cost is `rival`, their depths counted.
+def explains(zoom: Zoom, rival: float, worst: float) -> bool:
+    """Whether it explains its points as well as a motion whose cost is `rival`, the points' depths counted.
 
     Both costs are sums of squared distances over sigma squared, of `worst` at most. By Torr's geometric robust
     information criterion: a motion has a parameter more, and a depth for every point, which fits noise too.
     Source: Torr 1999, "Model selection for two view geometry".
     """
-    n = jnp.sum(mask)
-    cost = jnp.sum(jnp.where(mask, jnp.minimum(zoom.distance, worst), 0.0))
-    return cost < rival + n * DEPTH + jnp.log(4.0 * n)
+    n = len(zoom.distance)
+    return float(np.minimum(zoom.distance, worst).sum()) < rival + n * DEPTH + math.log(4 * n)

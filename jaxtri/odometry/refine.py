@@ -83,6 +83,7 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
         poses[at:first] = [_in(pose, moved) for pose in poses[at:first]]
         segment = Segment.of(odometry, first, end)
         noise = float(np.median([p.noise for p in odometry.poses[first:end]]))
+        # Robust weights widen with it, other than in the filter: this is the noise of all, not of a few blurred frames.
         settings = replace(odometry.settings, sigma=odometry.settings.sigma * noise)
         keys = keyframes(settings, segment)
         last = poses[end - 1].T_camera_world

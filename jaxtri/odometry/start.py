@@ -118,10 +118,9 @@ def find(settings: Settings, start: StartSettings, frames: list[Observations]) -
         remedy = "give a longer sequence with sideways motion, or ask for less parallax (--min-parallax)"
         return Start(None, f"{seen}: the camera all but turns on the spot, or the scene is far away; {remedy}")
     if not start.eight_point:  # the paper's way, two frames in a row, knows no such doubt
-        arrays = (jnp.asarray(x) for x in (first.u, last.u, common))
-        turned = zoom.fit(*arrays, settings.sigma)
-        if zoom.explains(turned, common, best.cost, GATE**2):
-            return Start(None, _zoomed(float(turned.scale)), over=True)
+        turned = zoom.fit(first.u, last.u, common, float(settings.sigma))
+        if zoom.explains(turned, best.cost, GATE**2):
+            return Start(None, _zoomed(turned.scale), over=True)
     return Start(best, "")
 
 
@@ -201,8 +200,10 @@ def fill(
             reports.append((frame, report))
         return state, reports
 
-    # Twice: the points of the pair, too, have the noise that the frames between show.
-    return over(max(float(report.noise) for _, report in over(1.0)[1]))
+    once = over(1.0)
+    noise = max(float(report.noise) for _, report in once[1])
+    # Where the frames between show more noise than is assumed, once more: the points of the pair have it, too.
+    return once if noise == 1 else over(noise)
 
 
 def hold(

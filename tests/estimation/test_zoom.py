@@ -37,24 +37,24 @@ def _cost(direction, u1, u2):
 
 
 def test_a_turn_and_a_zoom_are_found_whatever_stands_in_masked_slots():
-    u1, u2 = (jnp.asarray(u) for u in two_views([0, 0, 0], 1.2, noise_px=0))
-    mask = jnp.arange(N) < 200
-    u2 = u2.at[200:].set(jnp.nan).at[:20].add(0.3)  # a tenth are outliers
-    found = zoom.fit(u1, u2, mask, SIGMA)
-    np.testing.assert_allclose(found.rotation.log(), TURN, atol=2e-4)
+    u1, u2 = two_views([0, 0, 0], 1.2, noise_px=0)
+    mask = np.arange(N) < 200
+    u2[200:], u2[:20] = np.nan, u2[:20] + 0.3  # a tenth are outliers
+    found = zoom.fit(u1, u2, mask, float(SIGMA))
+    np.testing.assert_allclose(found.turn, TURN, atol=2e-4)
     np.testing.assert_allclose(found.scale, 1.2, atol=2e-4)
-    assert np.median(found.distance[:200]) < 0.1
+    assert np.median(found.distance) < 0.1
 
 
 @pytest.mark.parametrize("scale", [0.85, 1.0, 1.15])
 def test_a_zoom_is_not_taken_for_a_motion(scale):
-    u1, u2 = (jnp.asarray(u) for u in two_views([0, 0, 0], scale))
-    found = zoom.fit(u1, u2, jnp.ones(N, bool), SIGMA)
-    assert zoom.explains(found, jnp.ones(N, bool), epipolar_cost(u1, u2, [0.01, 0, -0.3]), 16.0)
+    u1, u2 = two_views([0, 0, 0], scale)
+    found = zoom.fit(u1, u2, np.ones(N, bool), float(SIGMA))
+    assert zoom.explains(found, epipolar_cost(u1, u2, [0.01, 0, -0.3]), 16.0)
 
 
 @pytest.mark.parametrize(("T", "flat"), [([0.1, 0, 0], False), ([0.1, 0, 0], True), ([0.02, 0, -0.4], False)])
 def test_a_motion_is_not_taken_for_a_zoom(T, flat):
-    u1, u2 = (jnp.asarray(u) for u in two_views(T, 1.0, flat=flat))
-    found = zoom.fit(u1, u2, jnp.ones(N, bool), SIGMA)
-    assert not zoom.explains(found, jnp.ones(N, bool), epipolar_cost(u1, u2, T), 16.0)
+    u1, u2 = two_views(T, 1.0, flat=flat)
+    found = zoom.fit(u1, u2, np.ones(N, bool), float(SIGMA))
+    assert not zoom.explains(found, epipolar_cost(u1, u2, T), 16.0)
