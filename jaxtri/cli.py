@@ -2,11 +2,12 @@
 
 import sys
 import warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from tyro.conf import arg
 
 from jaxtri.errors import CameraError, InputError, InputWarning, JaxtriError
 
@@ -19,53 +20,91 @@ if TYPE_CHECKING:
 GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
 
 
+FileOption = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")]
+Rate = Annotated[float | None, arg(metavar="RATE", help_behavior_hint="(default: the source's times)")]
+Frames = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")]
+
+
+# The groups of `jaxtri track --help`. They have no docstrings: help would repeat them above each.
+@dataclass
+class _Input:
+    scale_camera: bool = False
+    """Scale the calibration to the frames: resized, not cropped."""
+    calibration_error: Annotated[
+        float | None, arg(metavar="SHARE", help_behavior_hint="(default: 0.003; 0.05 with --fov)")
+    ] = None
+    """Error of the focal length, as a share of it."""
+    strict: bool = False
+    """Fail on a truncated source instead of warning."""
+
+
+@dataclass
+class _Tracker:
+    features: Annotated[int, arg(metavar="N")] = 800
+    """Features followed at once."""
+    noise_px: Annotated[float, arg(metavar="PX")] = 0.4
+    """Standard deviation of a tracked point, pixels."""
+    starts: Annotated[str, arg(metavar="WHO")] = "opencv"
+    """Who proposes starts: opencv, or poselib beside it."""
+    min_parallax: Annotated[
+        float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 1; 0.1 with --base paper)")
+    ] = None
+    """Least median parallax of a start."""
+
+
+@dataclass
+class _Filter:
+    base: Annotated[str, arg(metavar="KIND")] = "tracks"
+    """Base frames: tracks, inherit or paper."""
+    overlap: Annotated[int, arg(metavar="N")] = 1
+    """Frames that two segments share (--base paper)."""
+    refine: bool = True
+    """Adjust all keyframes together at the end of a file."""
+
+
+@dataclass
+class _Output:
+    overlay: bool = True
+    """Write overlay.mp4."""
+    place: Annotated[
+        tuple[float, float] | None, arg(metavar="U V", help_behavior_hint="(default: on the dominant plane)")
+    ] = None
+    """Pixel of the middle frame where the car stands."""
+    recording: bool = False
+    """Write recording.rrd (extra viewer)."""
+
+
 @dataclass
 class Track:
     """Recover a camera's motion from a video and write the trajectory, a plot, an overlay and the points."""
 
-    source: tyro.conf.Positional[str]
+    source: tyro.conf.Positional[Annotated[str, arg(metavar="SOURCE")]]
     """A video file, a folder of frames, or the number of a camera."""
-    camera: Path | None = None
-    """Calibration: camera.json, or the file of OpenCV, ROS, Kalibr, COLMAP, ...; FILE#NAME of several cameras."""
-    scale_camera: bool = False
-    """Scale the calibration to the size of the frames, where those were resized as a whole and not cropped."""
-    fov: float | None = None
-    """Horizontal field of view in degrees, where there is no calibration."""
-    out: Path = Path("out")
+    camera: FileOption = None
+    """Calibration: camera.json, or of another tool; FILE#NAME of many."""
+    fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: by --camera)")] = None
+    """Horizontal field of view, if not calibrated."""
+    out: Annotated[Path, arg(metavar="DIR")] = Path("out")
     """Folder of the results."""
-    base: str = "tracks"
-    """Base frames: `tracks` (a window of keyframes), `inherit` (one pair, restarts from tracked frames) or `paper`
-    (one pair, restarts from consecutive frames)."""
-    overlap: int = 1
-    """Frames that two segments share (with `--base paper`)."""
-    noise_px: float = 0.4
-    """Standard deviation of a tracked point, pixels."""
-    calibration_error: float | None = None
-    """What the focal length may be off by, as a share of it (0.003; 0.05 with `--fov`): it is in the covariances."""
-    mask: Path | None = None
-    """Picture, or folder of one a frame, of the frames' size: what is white (a logo, the bonnet) is ignored."""
-    features: int = 800
-    """Features followed at once."""
-    min_parallax: float | None = None
-    """Least median parallax of the first base pair, degrees (1; 0.1 with `--base paper`)."""
-    fps: float | None = None
-    """Frames a second, instead of the source's own times."""
-    max_frames: int | None = None
+    mask: FileOption = None
+    """Picture, or folder of one a frame: white is ignored."""
+    fps: Rate = None
+    """Frames a second."""
+    max_frames: Frames = None
     """Stop after so many frames."""
-    place: tuple[float, float] | None = None
-    """Where the car stands: pixel u v in the middle frame; on the dominant plane by default."""
-    refine: bool = True
-    """Adjust all keyframes together at the end of a file; what a camera shows is left as it was followed."""
-    overlay: bool = True
-    """Write overlay.mp4."""
-    recording: bool = False
-    """Write recording.rrd for the rerun viewer (extra `viewer`)."""
-    starts: str = "opencv"
-    """Who proposes the relative poses of a start: `opencv`, or `poselib` beside it (extra `init`)."""
-    strict: bool = False
-    """Fail on a truncated source instead of warning."""
     quiet: bool = False
     """No progress bar."""
+    input: _Input = field(default_factory=_Input)
+    tracker: _Tracker = field(default_factory=_Tracker)
+    filter: _Filter = field(default_factory=_Filter)
+    output: _Output = field(default_factory=_Output)
+
+    def flat(self) -> dict[str, Any]:
+        """All options by the names that they have on the command line, whatever their group."""
+        found: dict[str, Any] = {}
+        for name, value in asdict(self).items():
+            found |= value if isinstance(value, dict) else {name: value}
+        return found
 
 
 @dataclass
@@ -99,7 +138,8 @@ class Demo:
 
 
 Command = (
-    Annotated[Track, tyro.conf.subcommand("track")]
+    # Without prefixes it is --noise-px, not --tracker.noise-px.
+    Annotated[Track, tyro.conf.subcommand("track"), tyro.conf.OmitArgPrefixes]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -142,7 +182,7 @@ def _track(options: Track) -> None:
     live = options.source.isdecimal() and not Path(options.source).exists()
     if live and options.max_frames is None:
         print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
-    with open_source(options.source, fps=options.fps, strict=options.strict, mask=options.mask) as source:
+    with open_source(options.source, fps=options.fps, strict=options.input.strict, mask=options.mask) as source:
         if not live:
             read = (options.source, options.camera, options.mask)
             spare(options.out, [Path(p) for p in read if p is not None], source.folder)
@@ -151,17 +191,17 @@ def _track(options: Track) -> None:
         if live:
             warm_up(camera, **how)
         frames: Any = spool(source, options.out / "frames") if live else source
-        refine = options.refine and not live
+        refine = options.filter.refine and not live
         more = {"progress": not options.quiet, "max_frames": options.max_frames, "refine": refine}
         run = track(frames, camera, **more, **how)
         fps = source.fps
-    said = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
+    said = {k: str(v) if isinstance(v, Path) else v for k, v in options.flat().items()}
     paths = write_results(run, options.out, said)
-    if options.recording:
+    if options.output.recording:
         from jaxtri.output.viewer import write_recording
 
         paths.append(write_recording(run, camera, options.out / "recording.rrd"))
-    if options.overlay:
+    if options.output.overlay:
         paths += _overlay(options, run, camera, options.out / "frames" if live else options.source, fps)
     print(run_text(run, paths))
 
@@ -175,9 +215,9 @@ def _overlay(options: Track, run: Any, camera: "Camera", source: Path | str, fps
         warnings.simplefilter("ignore", InputWarning)  # said once already
         path = options.out / "overlay.mp4"
         try:
-            return [write_overlay(run, again, camera, path, fps, at=options.place, progress=not options.quiet)]
+            return [write_overlay(run, again, camera, path, fps, at=options.output.place, progress=not options.quiet)]
         except InputError as error:
-            if options.place is not None:
+            if options.output.place is not None:
                 raise
             print(f"jaxtri: warning: no overlay: {error}", file=sys.stderr)
             return []
@@ -186,13 +226,14 @@ def _overlay(options: Track, run: Any, camera: "Camera", source: Path | str, fps
 def _check(options: Track) -> None:
     """Numbers and words that no run can use, named before anything is opened."""
     least = {"features": 50, "overlap": 1, "max_frames": 1, "min_parallax": 0, "noise_px": 1e-6, "calibration_error": 0}
+    given = options.flat()
     for name, low in least.items():
-        value = getattr(options, name)
+        value = given[name]
         if value is not None and not low <= value < float("inf"):
             raise InputError(f"--{name.replace('_', '-')} {value:g}: give a number of at least {low:g}")
     for name, words in {"base": ("tracks", "inherit", "paper"), "starts": ("opencv", "poselib")}.items():
-        if getattr(options, name) not in words:
-            raise InputError(f"--{name} {getattr(options, name)}: choose one of {', '.join(words)}")
+        if given[name] not in words:
+            raise InputError(f"--{name} {given[name]}: choose one of {', '.join(words)}")
     if options.out.exists() and not options.out.is_dir():
         raise InputError(f"--out {options.out} is a file: give a folder")
 
@@ -204,7 +245,7 @@ def _camera(options: Track, source: "FrameSource") -> "Camera":
     w, h = source.size
     if options.camera is not None and options.fov is None:
         try:
-            return read_camera(options.camera, width=w, height=h, scale=options.scale_camera)
+            return read_camera(options.camera, width=w, height=h, scale=options.input.scale_camera)
         except CameraError as error:
             if source.turned_deg not in (90, 270):
                 raise
@@ -223,17 +264,17 @@ def _how(camera: "Camera", options: Track) -> dict[str, Any]:
     from jaxtri.odometry.settings import CALIBRATED, Base, Settings, StartSettings
     from jaxtri.vision.klt import KLTSettings
 
-    base = Base(options.base)
-    changes = {} if options.min_parallax is None else {"parallax_deg": options.min_parallax}
-    poselib = options.starts == "poselib"
+    base = Base(options.filter.base)
+    changes = {} if options.tracker.min_parallax is None else {"parallax_deg": options.tracker.min_parallax}
+    poselib = options.tracker.starts == "poselib"
     calibration = CALIBRATED if options.fov is None else GUESS
-    if options.calibration_error is not None:
-        calibration = options.calibration_error
+    if options.input.calibration_error is not None:
+        calibration = options.input.calibration_error
     return {
         "base": base,
-        "settings": Settings.of(camera, noise_px=options.noise_px, calibration=calibration),
-        "start": StartSettings.of(base, overlap=options.overlap, poselib=poselib, **changes),
-        "klt": KLTSettings(capacity=options.features),
+        "settings": Settings.of(camera, noise_px=options.tracker.noise_px, calibration=calibration),
+        "start": StartSettings.of(base, overlap=options.filter.overlap, poselib=poselib, **changes),
+        "klt": KLTSettings(capacity=options.tracker.features),
     }
 
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxtri.cli import main
+from jaxtri.cli import Track, main
 from jaxtri.formats import read_tum
 from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.trajectory import evaluate
@@ -210,6 +210,20 @@ def test_the_installed_command_has_help():
     assert {"track", "evaluate", "demo"} <= set(
         done.stdout.replace(",", " ").replace("{", " ").replace("}", " ").split()
     )
+
+
+def test_the_help_of_track_fits_on_a_screen_and_settings_are_flat(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit) as stop:
+        main(["track", "--help"])
+    assert stop.value.code == 0
+    said = capsys.readouterr().out
+    assert len(said.splitlines()) <= 55
+    names = set(Track("a").flat()) - {"source"}
+    assert {"camera", "fov", "noise_px", "base", "refine", "place", "strict"} <= names
+    assert all(f"--{name.replace('_', '-')}" in said for name in names)
+    assert "(default: 0.4)" in said
+    assert said.index("--camera") < said.index("--max-frames") < said.index("tracker") < said.index("--noise-px")
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"the real sequences are not at {DATA}")
