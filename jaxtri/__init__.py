@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from jaxtri.output.plot import plot_trajectory
     from jaxtri.output.results import write_overlay, write_results
     from jaxtri.vision.klt import KLT, KLTSettings
+    from jaxtri.vision.survey import Survey, survey
     from jaxtri.vision.video import open_source
 
 # Loaded when they are asked for: what they stand on, OpenCV above all, takes time and need not be there.
@@ -79,6 +80,7 @@ _LATER = {
     "Points": "jaxtri.odometry.structure",
     "Refinement": "jaxtri.odometry.refine",
     "Run": "jaxtri.odometry.run",
+    "Survey": "jaxtri.vision.survey",
     "follow_tracks": "jaxtri.odometry.run",
     "open_source": "jaxtri.vision.video",
     "plot_trajectory": "jaxtri.output.plot",
@@ -86,6 +88,7 @@ _LATER = {
     "read_timestamps": "jaxtri.formats",
     "read_trajectory": "jaxtri.formats",
     "refine": "jaxtri.odometry.refine",
+    "survey": "jaxtri.vision.survey",
     "track": "jaxtri.odometry.run",
     "tuning": "jaxtri.estimation",
     "warm_up": "jaxtri.odometry.run",
@@ -148,6 +151,7 @@ __all__ = [
     "StartSettings",
     "Status",
     "StructureAndMotion",
+    "Survey",
     "Trajectory",
     "TrajectoryError",
     "TrajectoryWarning",
@@ -183,6 +187,7 @@ __all__ = [
     "schmidt",
     "single_pair",
     "smoothing_bound",
+    "survey",
     "track",
     "track_pairs",
     "tuning",

@@ -1,4 +1,4 @@
-"""The command line: `jaxtri track`, `jaxtri evaluate`, `jaxtri demo`."""
+"""The command line: `jaxtri check`, `jaxtri track`, `jaxtri evaluate`, `jaxtri demo`."""
 
 import sys
 import warnings
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
 
 
+Source = tyro.conf.Positional[Annotated[str, arg(metavar="SOURCE")]]
 FileOption = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")]
 Rate = Annotated[float | None, arg(metavar="RATE", help_behavior_hint="(default: the source's times)")]
 Frames = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")]
@@ -78,7 +79,7 @@ class _Output:
 class Track:
     """Recover a camera's motion from a video and write the trajectory, a plot, an overlay and the points."""
 
-    source: tyro.conf.Positional[Annotated[str, arg(metavar="SOURCE")]]
+    source: Source
     """A video file, a folder of frames, or the number of a camera."""
     camera: FileOption = None
     """Calibration: camera.json, or of another tool; FILE#NAME of many."""
@@ -105,6 +106,24 @@ class Track:
         for name, value in asdict(self).items():
             found |= value if isinstance(value, dict) else {name: value}
         return found
+
+
+@dataclass
+class Check:
+    """Say what a video shows and whether it can be tracked: size, times, light, blur, features, flow, cuts, faults."""
+
+    source: Source
+    """A video file, a folder of frames, or the number of a camera."""
+    mask: FileOption = None
+    """Picture, or folder of one a frame: white is ignored."""
+    fps: Rate = None
+    """Frames a second."""
+    max_frames: Frames = None
+    """Stop after so many frames."""
+    json: FileOption = None
+    """Write the figures of every frame here."""
+    quiet: bool = False
+    """No progress bar."""
 
 
 @dataclass
@@ -138,8 +157,9 @@ class Demo:
 
 
 Command = (
+    Annotated[Check, tyro.conf.subcommand("check")]
     # Without prefixes it is --noise-px, not --tracker.noise-px.
-    Annotated[Track, tyro.conf.subcommand("track"), tyro.conf.OmitArgPrefixes]
+    | Annotated[Track, tyro.conf.subcommand("track"), tyro.conf.OmitArgPrefixes]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -151,17 +171,18 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     arguments = [f"./{a}" if a.startswith("-") and Path(a).exists() else a for a in arguments]
     command = tyro.cli(Command, args=arguments, prog="jaxtri", description=__doc__)  # pyright: ignore
-    import jax
+    if not isinstance(command, Check):  # which computes nothing by JAX
+        import jax
 
-    from jaxtri.compilation import keep_programs
+        from jaxtri.compilation import keep_programs
 
-    jax.config.update("jax_enable_x64", True)
-    keep_programs()
+        jax.config.update("jax_enable_x64", True)
+        keep_programs()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
             warnings.showwarning = _show
-            {Track: _track, Evaluate: _evaluate, Demo: _demo}[type(command)](command)
+            {Check: _check_source, Track: _track, Evaluate: _evaluate, Demo: _demo}[type(command)](command)
     except (JaxtriError, OSError) as error:
         print(f"jaxtri: error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -172,6 +193,31 @@ def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
         print(f"jaxtri: warning: {message}", file=sys.stderr)
 
 
+def _is_live(options: Check | Track) -> bool:
+    """Whether the source is a camera; that it runs on is said."""
+    live = options.source.isdecimal() and not Path(options.source).exists()
+    if live and options.max_frames is None:
+        print("a camera runs on: stop with Ctrl-C, what was seen so far is kept", file=sys.stderr)
+    return live
+
+
+def _check_source(options: Check) -> None:
+    from jaxtri.formats import write_json
+    from jaxtri.output.check import check_text, findings, verdict
+    from jaxtri.vision.survey import survey
+    from jaxtri.vision.video import open_source
+
+    if options.max_frames is not None and options.max_frames < 1:
+        raise InputError(f"--max-frames {options.max_frames}: give a number of at least 1")
+    _is_live(options)
+    with open_source(options.source, fps=options.fps, mask=options.mask) as source:
+        found = survey(source, max_frames=options.max_frames, progress=not options.quiet)
+    wrong = findings(found)
+    print(check_text(found, wrong))
+    if options.json is not None:
+        write_json(options.json, {"verdict": verdict(wrong), "findings": wrong, "figures": found})
+
+
 def _track(options: Track) -> None:
     from jaxtri.odometry.run import track, warm_up
     from jaxtri.output.report import run_text
@@ -179,9 +225,7 @@ def _track(options: Track) -> None:
     from jaxtri.vision.video import open_source, spool
 
     _check(options)
-    live = options.source.isdecimal() and not Path(options.source).exists()
-    if live and options.max_frames is None:
-        print("a camera runs on: stop with Ctrl-C, what was tracked is kept", file=sys.stderr)
+    live = _is_live(options)
     with open_source(options.source, fps=options.fps, strict=options.input.strict, mask=options.mask) as source:
         if not live:
             read = (options.source, options.camera, options.mask)

@@ -1,1 +1,1 @@
-"""The files and pictures of a run. Nothing here is computed that a run does not hold."""
+"""The files and pictures of a run, and in words what runs and sources hold. Nothing is computed that they do not."""

@@ -15,6 +15,7 @@ from jaxtri.odometry.run import Run
 from jaxtri.odometry.settings import Status
 from jaxtri.output.overlay import car, draw_text, draw_wireframe, place
 from jaxtri.output.plot import plot_trajectory
+from jaxtri.output.words import ranges
 from jaxtri.trajectory import Trajectory
 from jaxtri.vision.video import Frame, write_video
 
@@ -68,7 +69,7 @@ def write_results(
     status = run.trajectory.status
     assert status is not None
     unsure = [
-        f"{NAMES[code]}: frames {_ranges(status == code)}" for code in NAMES if code != 1 and (status == code).any()
+        f"{NAMES[code]}: frames {ranges(status == code)}" for code in NAMES if code != 1 and (status == code).any()
     ]
     header = "timestamp tx ty tz qx qy qz qw   camera to world, camera x right y down z forward, scale: gauge"
     write_tum(paths[0], run.trajectory, "\n".join([header, *unsure]))
@@ -133,10 +134,3 @@ def write_overlay(
 
     write_video(path, drawn(), fps)
     return path
-
-
-def _ranges(mask: np.ndarray) -> str:
-    """The True entries as ranges: 0-4, 9."""
-    at = np.flatnonzero(mask)
-    groups = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
-    return ", ".join(f"{g[0]}-{g[-1]}" if len(g) > 1 else f"{g[0]}" for g in groups)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Thread
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -22,6 +22,8 @@ from jaxtri.vision.layouts import IMAGE_SUFFIXES
 from jaxtri.vision.masks import Masks
 from jaxtri.vision.quiet import quiet
 from jaxtri.vision.readers import Capture, Folder, Item
+
+T = TypeVar("T")
 
 DEFAULT_FPS = 25.0
 """Frames a second of a source that has no clock of its own and was given none."""
@@ -78,6 +80,7 @@ class FrameSource:
             MPEG) claim their duration times the rate.
         folder: Folder that holds the images, None for a video.
         fps: Nominal frames a second; `DEFAULT_FPS` where neither source nor caller says.
+        timed: Whether the source or the caller says when frames were taken; `DEFAULT_FPS` is assumed otherwise.
         turned_deg: Degrees clockwise by which the stored pixels are turned, as their metadata or EXIF orientation says.
         pixel_aspect: Width of a pixel over its height, as the metadata say; the images are not resized.
         decoded: Frames handed out so far.
@@ -89,7 +92,7 @@ class FrameSource:
         self.fps = fps or reader.fps or DEFAULT_FPS
         self.decoded = 0
         self._reader, self._strict, self._override = reader, strict, fps is not None
-        self._timed = fps is not None or reader.fps is not None or not isinstance(reader, Folder)
+        self.timed = fps is not None or reader.fps is not None or not isinstance(reader, Folder)
         self._time = -math.inf
         self._bad: list[str] = []
         self._ended = False
@@ -119,7 +122,7 @@ class FrameSource:
                 SourceWarning,
                 stacklevel=3,
             )
-        if not self._timed:
+        if not self.timed:
             warnings.warn(
                 f"{name}: no list of times and no names of images say when they were taken: {DEFAULT_FPS:g} frames a "
                 "second are assumed; give the rate (--fps) or a timestamps.txt",
@@ -238,13 +241,13 @@ def _opened(source: str | os.PathLike[str] | int, fps: float | None, strict: boo
     return FrameSource(text, interlaced.reader(path) or Capture(text, text), fps, strict)
 
 
-def ahead(frames: Iterable[Frame], depth: int = 4) -> Generator[Frame, None, None]:
+def ahead(frames: Iterable[T], depth: int = 4) -> Generator[T, None, None]:
     """The same frames, read by a thread of their own, up to `depth` of them before they are asked for.
 
     What the source raises is raised where its frame would have come. Close the generator (`contextlib.closing`) when
     you leave early: after that the thread no longer uses the source.
     """
-    ready: Queue[Frame | BaseException | None] = Queue(depth)
+    ready: Queue[T | BaseException | None] = Queue(depth)
     left = Event()
 
     def read() -> None:
