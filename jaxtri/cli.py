@@ -44,6 +44,8 @@ class Track:
     """What the focal length may be off by, as a share of it (0.003; 0.05 with `--fov`): it is in the covariances."""
     mask: Path | None = None
     """Picture, or folder of one a frame, of the frames' size: what is white (a logo, the bonnet) is ignored."""
+    find_overlays: bool = True
+    """Find bars and overlays (a logo, a time code, the bonnet) by themselves, and ignore them."""
     features: int = 800
     """Features followed at once."""
     min_parallax: float | None = None
@@ -233,7 +235,7 @@ def _how(camera: "Camera", options: Track) -> dict[str, Any]:
         "base": base,
         "settings": Settings.of(camera, noise_px=options.noise_px, calibration=calibration),
         "start": StartSettings.of(base, overlap=options.overlap, poselib=poselib, **changes),
-        "klt": KLTSettings(capacity=options.features),
+        "klt": KLTSettings(capacity=options.features, find_overlays=options.find_overlays),
     }
 
 
