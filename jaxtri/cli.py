@@ -47,6 +47,8 @@ class _Tracker:
     """Standard deviation of a tracked point, pixels."""
     starts: Annotated[str, arg(metavar="WHO")] = "opencv"
     """Who proposes starts: opencv, or poselib beside it."""
+    find_overlays: bool = True
+    """Find bars, logos, a bonnet by themselves, and ignore them."""
     min_parallax: Annotated[
         float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 1; 0.1 with --base paper)")
     ] = None
@@ -318,7 +320,7 @@ def _how(camera: "Camera", options: Track) -> dict[str, Any]:
         "base": base,
         "settings": Settings.of(camera, noise_px=options.tracker.noise_px, calibration=calibration),
         "start": StartSettings.of(base, overlap=options.filter.overlap, poselib=poselib, **changes),
-        "klt": KLTSettings(capacity=options.tracker.features),
+        "klt": KLTSettings(capacity=options.tracker.features, find_overlays=options.tracker.find_overlays),
     }
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,7 +16,7 @@ from tqdm import tqdm
 
 from jaxtri.checks import ArrayOrList, booleans, numbers
 from jaxtri.compilation import capacity
-from jaxtri.errors import CameraError, InputError
+from jaxtri.errors import CameraError, InputError, InputWarning
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.driver import Odometry
@@ -27,6 +28,8 @@ from jaxtri.odometry.structure import Points
 from jaxtri.trajectory import Trajectory, angle
 from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
 from jaxtri.vision.video import Frame, FrameSource, ahead
+
+MUCH = 0.3  # share of the picture above which what is ignored may be missed
 
 
 @dataclass
@@ -133,6 +136,7 @@ def track(
     change = None if refined is None else refined.statistics | _change(causal, best)
     poses = odometry.poses if refined is None else refined.poses
     statistics = _statistics(odometry, poses) | clock.statistics() | {"interrupted": interrupted, "refined": change}
+    statistics["ignored"] = _ignored(features)
     return Run(best, points, rgb, odometry, statistics, refined)
 
 
@@ -300,6 +304,19 @@ def _statistics(odometry: Odometry, poses: list[FramePose]) -> dict[str, object]
         "keyframes": odometry.keyframes,
         "points_used_per_frame": float(np.mean(used)) if used else 0.0,
     }
+
+
+def _ignored(features: KLT) -> dict[str, object]:
+    """The bars and overlays that were found; warns where they are much of the picture."""
+    found, share = features.found(), round(features.ignored_share(), 4)
+    if found and share > MUCH:
+        warnings.warn(
+            f"{share:.0%} of the picture is ignored, as bars or overlays (run.json says where): if they are none, give "
+            "--no-find-overlays, or KLTSettings(find_overlays=False), and mark what is one by --mask",
+            InputWarning,
+            stacklevel=3,
+        )
+    return {"share": share, "found": [part._asdict() for part in found]}
 
 
 def _change(before: Trajectory, after: Trajectory) -> dict[str, float]:

@@ -6,6 +6,8 @@ from pathlib import Path
 from jaxtri.odometry.run import Run
 from jaxtri.trajectory import Evaluation
 
+SHOWN = 4  # parts of the picture that are named of those that are ignored
+
 
 def run_text(run: Run, paths: Iterable[Path]) -> str:
     """What a run gave, and the files that it is in."""
@@ -24,6 +26,7 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
         frame, words = next(iter(doubts.items()))
         more = f", the first of {len(doubts)}" if len(doubts) > 1 else ""
         lines.append(f"frame {frame}{more}, is uncertain: {'; '.join(words)} (run.json has them all)")
+    lines += _ignored(s["ignored"])
     refined = s["refined"]
     if isinstance(refined, dict):
         seconds = s["seconds"]
@@ -37,6 +40,21 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
     if s["interrupted"]:
         lines.append("interrupted: these are the frames up to there")
     return "\n".join([*lines, *(f"  {path}" for path in paths)])
+
+
+def _ignored(ignored: object) -> list[str]:
+    """A line on the bars and overlays that were found; none where there are none."""
+    assert isinstance(ignored, dict)
+    found = ignored["found"]
+    if not found:
+        return []
+    parts = [
+        f"{part['kind']} at x {part['left']} to {part['right']}, y {part['top']} to {part['bottom']}, "
+        f"frame {part['first']} to {'the end' if part['last'] is None else part['last']}"
+        for part in found[:SHOWN]
+    ]
+    more = f"; and {len(found) - SHOWN} more (run.json has them all)" if len(found) > SHOWN else ""
+    return [f"{ignored['share']:.1%} of the picture ignored: {'; '.join(parts)}{more}"]
 
 
 def errors_text(found: Evaluation) -> str:

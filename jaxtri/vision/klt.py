@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from jaxtri.errors import ResolutionChangeError
+from jaxtri.vision.bars import Bars
+from jaxtri.vision.overlays import Ignored, Overlays
 
 STEPS, CLOSE = 30, 0.003  # optical flow ends after so many steps, or when a step is shorter than so many pixels
 BLOCK = 5  # pixels across, over which the strength of a corner is summed: a corner, and not the noise of one pixel
@@ -38,6 +40,8 @@ class KLTSettings:
             lower lets the number of features swing.
         cells: The image is divided into `cells` x `cells`, each of which gets its share of the features: spread over
             the whole view they fix the pose better than in one corner of it.
+        find_overlays: Ignore bars at the edges, and what stays in its place while the picture moves. Without it a logo,
+            a time code or a bonnet hold features that say that the camera stands.
     """
 
     capacity: int = 800
@@ -49,6 +53,7 @@ class KLTSettings:
     anchor_move: float = 1.5
     refill: float = 0.8
     cells: int = 8
+    find_overlays: bool = True
 
 
 class FrameTracks(NamedTuple):
@@ -101,7 +106,10 @@ class KLT:
         self._frame = -1
         self._next_id = 0
         self._shape: tuple[int, ...] | None = None
-        self._ignore: tuple[np.ndarray | None, np.ndarray | None] = None, None  # as given, and with its surroundings
+        self._parts: list[np.ndarray | None] = []  # what is ignored: as given, the bars, the overlays
+        self._ignore: np.ndarray | None = None  # all of it, with its surroundings
+        self._bars = Bars()
+        self._overlays: Overlays | None = None
 
     def track(self, image: np.ndarray, ignore: np.ndarray | None = None) -> FrameTracks:
         """Follow all features into `image` (h, w) or (h, w, 3) uint8, and fill the free slots.
@@ -127,8 +135,9 @@ class KLT:
             self._alive[slots] = ok
             self._realign(gray, error, eigenvalue)
             self._separate()
-        if ignore is not self._ignore[0]:
-            self._ignore = ignore, self._around(ignore)
+        parts = [ignore, *(self._find(gray) if self.settings.find_overlays else ())]
+        if [id(p) for p in parts] != [id(p) for p in self._parts]:
+            self._parts, self._ignore = parts, self._around(parts)
         self._alive &= ~self._ignored()
         fresh = np.zeros(self.settings.capacity, bool)
         if self._alive.sum() < self.settings.refill * self.settings.capacity:
@@ -140,6 +149,24 @@ class KLT:
     def drop(self, ids: np.ndarray) -> None:
         """Give up the features of these numbers: the filter found them to be outliers."""
         self._alive &= ~np.isin(self._ids, ids)
+
+    def found(self) -> list[Ignored]:
+        """The bars and overlays that were found so far, in the order in which they were."""
+        overlays = [] if self._overlays is None else self._overlays.regions()
+        return sorted([*self._bars.regions(), *overlays], key=lambda part: part.first)
+
+    def ignored_share(self) -> float:
+        """The share of the picture in which the latest frame may hold no features."""
+        return 0.0 if self._ignore is None else float(self._ignore.mean())
+
+    def _find(self, gray: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """What is found to be ignored (h, w): bars and overlays."""
+        if self._overlays is None:
+            h, w = gray.shape
+            self._overlays = Overlays((h, w), self.settings.window, self.settings.capacity)
+        moved = self._overlays.see(gray, self._frame, self._pixels, self._ids, self._alive)
+        self._bars.see(gray, self._frame, moved)
+        return self._bars.mask, self._overlays.mask
 
     def _follow(self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
         """The flow from frame to frame, of features that stay inside; as of `_flow`.
@@ -216,21 +243,24 @@ class KLT:
         margin = self.settings.window // 4
         return np.all((pixels >= margin) & (pixels < np.array([w, h]) - margin), axis=1)
 
-    def _around(self, ignore: np.ndarray | None) -> np.ndarray | None:
+    def _around(self, parts: list[np.ndarray | None]) -> np.ndarray | None:
         """What is ignored (h, w), and half a patch around: a patch that holds some of it follows that, too."""
-        if ignore is None:
+        for part in parts:
+            if part is not None and part.shape != self._shape:
+                raise ResolutionChangeError(f"ignore is of shape {part.shape}, the image of {self._shape}")
+        there = [part for part in parts if part is not None]
+        if not there:
             return None
-        if ignore.shape != self._shape:
-            raise ResolutionChangeError(f"ignore is of shape {ignore.shape}, the image of {self._shape}")
+        ignore = np.logical_or.reduce(there)
         return cv2.dilate(ignore.astype(np.uint8), np.ones((self.settings.window | 1,) * 2, np.uint8)).astype(bool)
 
     def _ignored(self) -> np.ndarray:
         """The slots (n,) whose feature lies in what is ignored."""
-        if self._ignore[1] is None or self._shape is None:
+        if self._ignore is None or self._shape is None:
             return np.zeros(len(self._alive), bool)
         x, y = np.rint(self._pixels).astype(int).T
         h, w = self._shape[:2]
-        return self._ignore[1][y.clip(0, h - 1), x.clip(0, w - 1)]
+        return self._ignore[y.clip(0, h - 1), x.clip(0, w - 1)]
 
     def _separate(self) -> None:
         """Give up features that have run into an older one."""
@@ -247,8 +277,8 @@ class KLT:
     def _fill(self, gray: np.ndarray) -> np.ndarray:
         s = self.settings
         mask = np.full(gray.shape[:2], 255, np.uint8)
-        if self._ignore[1] is not None:
-            mask[self._ignore[1]] = 0
+        if self._ignore is not None:
+            mask[self._ignore] = 0
         for x, y in self._pixels[self._alive]:
             cv2.circle(mask, (round(float(x)), round(float(y))), int(s.spacing), 0, -1)
         corners = cv2.goodFeaturesToTrack(

@@ -1,6 +1,7 @@
 """The whole pipeline over a generated scene."""
 
 import time
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from footage import clip
 
+from jaxtri.errors import InputWarning
 from jaxtri.formats import read_camera
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.run import track
 from jaxtri.odometry.settings import Settings, StartSettings, Status
+from jaxtri.output.report import run_text
 from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.trajectory import evaluate
 from jaxtri.vision.klt import KLT, KLTSettings
@@ -30,6 +33,23 @@ def test_twenty_frames_are_enough_for_a_trajectory_and_its_points():
     assert len(run.points.ids) > 100
     assert run.colours.shape == run.points.xyz.shape
     assert run.statistics["frames"] == len(frames)
+    assert run.statistics["ignored"] == {"share": 0.0, "found": []}
+
+
+def test_what_is_ignored_of_the_picture_is_said_and_warned_of():
+    camera, frames, _ = clip()
+    barred = [replace(frame, image=frame.image.copy()) for frame in frames]
+    for frame in barred:
+        frame.image[:40], frame.image[-40:] = 0, 0
+    with pytest.warns(InputWarning, match="3[0-9]% of the picture is ignored.*--no-find-overlays"):
+        run = track(barred, camera, klt=KLTSettings(capacity=128), progress=False)
+    ignored = run.statistics["ignored"]
+    assert isinstance(ignored, dict)
+    assert [part["bottom"] for part in ignored["found"]] == [39, 239]
+    text = run_text(run, [])
+    assert "% of the picture ignored: bar at x 0 to 319, y 0 to 39, frame 0 to the end; bar at" in text
+    plain = KLTSettings(capacity=128, find_overlays=False)
+    assert track(barred, camera, klt=plain, progress=False).statistics["ignored"] == {"share": 0.0, "found": []}
 
 
 def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatch):
