@@ -60,9 +60,11 @@ from jaxtri.trajectory import Trajectory, align, ate_rmse, evaluate, nees, relat
 if TYPE_CHECKING:
     from jaxtri.estimation import tuning
     from jaxtri.formats import read_camera, read_timestamps, read_trajectory, write_camera, write_tum
+    from jaxtri.odometry.calibrate import Calibration, calibrate
     from jaxtri.odometry.driver import Odometry
     from jaxtri.odometry.poses import FramePose
     from jaxtri.odometry.refine import Refinement, refine
+    from jaxtri.odometry.rounds import track_uncalibrated
     from jaxtri.odometry.run import Run, follow_tracks, track, warm_up
     from jaxtri.odometry.structure import Points
     from jaxtri.output.plot import plot_trajectory
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
 
 # Loaded when they are asked for: what they stand on, OpenCV above all, takes time and need not be there.
 _LATER = {
+    "Calibration": "jaxtri.odometry.calibrate",
     "FramePose": "jaxtri.odometry.poses",
     "KLT": "jaxtri.vision.klt",
     "KLTSettings": "jaxtri.vision.klt",
@@ -81,6 +84,7 @@ _LATER = {
     "Refinement": "jaxtri.odometry.refine",
     "Run": "jaxtri.odometry.run",
     "Survey": "jaxtri.vision.survey",
+    "calibrate": "jaxtri.odometry.calibrate",
     "follow_tracks": "jaxtri.odometry.run",
     "open_source": "jaxtri.vision.video",
     "plot_trajectory": "jaxtri.output.plot",
@@ -90,6 +94,7 @@ _LATER = {
     "refine": "jaxtri.odometry.refine",
     "survey": "jaxtri.vision.survey",
     "track": "jaxtri.odometry.run",
+    "track_uncalibrated": "jaxtri.odometry.rounds",
     "tuning": "jaxtri.estimation",
     "warm_up": "jaxtri.odometry.run",
     "write_camera": "jaxtri.formats",
@@ -122,6 +127,7 @@ __all__ = [
     "BasePoint",
     "Belief",
     "BrownConrady",
+    "Calibration",
     "Camera",
     "CameraError",
     "Depth",
@@ -167,6 +173,7 @@ __all__ = [
     "align",
     "ate_rmse",
     "batch",
+    "calibrate",
     "capacity",
     "ekf",
     "evaluate",
@@ -190,6 +197,7 @@ __all__ = [
     "survey",
     "track",
     "track_pairs",
+    "track_uncalibrated",
     "tuning",
     "two_view",
     "warm_up",

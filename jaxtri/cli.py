@@ -14,28 +14,33 @@ from jaxtri.errors import CameraError, InputError, InputWarning, JaxtriError
 # The rest is imported where it is called: help and a wrong option need not wait for it.
 if TYPE_CHECKING:
     from jaxtri.geometry.camera import Camera
+    from jaxtri.odometry.settings import Settings
     from jaxtri.vision.video import FrameSource
 
 
 GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
-
+USUAL = 60.0  # degrees: the field of view that the search begins with where nothing is known
+FROM_FOV, FROM_FILE = 0.3, 0.05  # what a focal length that is refined may be off by beforehand, as a share of it
 
 Source = tyro.conf.Positional[Annotated[str, arg(metavar="SOURCE")]]
 FileOption = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")]
 Rate = Annotated[float | None, arg(metavar="RATE", help_behavior_hint="(default: the source's times)")]
 Frames = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")]
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # without its --no- form: it is off by default
 
 
-# The groups of `jaxtri track --help`. They have no docstrings: help would repeat them above each.
+# The groups of `jaxtri track --help`. They have no docstrings: help would repeat them.
 @dataclass
 class _Input:
-    scale_camera: bool = False
+    refine_camera: Switch = False
+    """Estimate focal length and lens, from --camera or --fov on."""
+    scale_camera: Switch = False
     """Scale the calibration to the frames: resized, not cropped."""
     calibration_error: Annotated[
-        float | None, arg(metavar="SHARE", help_behavior_hint="(default: 0.003; 0.05 with --fov)")
+        float | None, arg(metavar="SHARE", help_behavior_hint="(default: .003; .05 with --fov)")
     ] = None
     """Error of the focal length, as a share of it."""
-    strict: bool = False
+    strict: Switch = False
     """Fail on a truncated source instead of warning."""
 
 
@@ -73,7 +78,7 @@ class _Output:
         tuple[float, float] | None, arg(metavar="U V", help_behavior_hint="(default: on the dominant plane)")
     ] = None
     """Pixel of the middle frame where the car stands."""
-    recording: bool = False
+    recording: Switch = False
     """Write recording.rrd (extra viewer)."""
 
 
@@ -85,7 +90,7 @@ class Track:
     """A video file, a folder of frames, or the number of a camera."""
     camera: FileOption = None
     """Calibration: camera.json, or of another tool; FILE#NAME of many."""
-    fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: by --camera)")] = None
+    fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: from the video)")] = None
     """Horizontal field of view, if not calibrated."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("out")
     """Folder of the results."""
@@ -95,7 +100,7 @@ class Track:
     """Frames a second."""
     max_frames: Frames = None
     """Stop after so many frames."""
-    quiet: bool = False
+    quiet: Switch = False
     """No progress bar."""
     input: _Input = field(default_factory=_Input)
     tracker: _Tracker = field(default_factory=_Tracker)
@@ -124,7 +129,7 @@ class Check:
     """Stop after so many frames."""
     json: FileOption = None
     """Write the figures of every frame here."""
-    quiet: bool = False
+    quiet: Switch = False
     """No progress bar."""
 
 
@@ -154,7 +159,7 @@ class Demo:
     """Length of the sequence."""
     seed: int = 0
     """Of the noise in the images."""
-    quiet: bool = False
+    quiet: Switch = False
     """No progress bar."""
 
 
@@ -183,16 +188,24 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
-            warnings.showwarning = _show
+            warnings.showwarning = _Shown()
             {Check: _check_source, Track: _track, Evaluate: _evaluate, Demo: _demo}[type(command)](command)
     except (JaxtriError, OSError) as error:
         print(f"jaxtri: error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 
 
-def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, InputWarning):
-        print(f"jaxtri: warning: {message}", file=sys.stderr)
+class _Shown:
+    """Shows warnings of the input, each once: a source may be read several times."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        text = f"jaxtri: warning: {message}"
+        if issubclass(category, InputWarning) and text not in self._said:
+            self._said.add(text)
+            print(text, file=sys.stderr)
 
 
 def _is_live(options: Check | Track) -> bool:
@@ -221,26 +234,37 @@ def _check_source(options: Check) -> None:
 
 
 def _track(options: Track) -> None:
+    from jaxtri.odometry.rounds import track_uncalibrated
     from jaxtri.odometry.run import track, warm_up
     from jaxtri.output.report import run_text
-    from jaxtri.output.results import spare, write_results
+    from jaxtri.output.results import CAMERA, FILES, spare, write_results
     from jaxtri.vision.video import open_source, spool
 
     _check(options)
     live = _is_live(options)
-    with open_source(options.source, fps=options.fps, strict=options.input.strict, mask=options.mask) as source:
+
+    def reopen() -> "FrameSource":
+        return open_source(options.source, fps=options.fps, strict=options.input.strict, mask=options.mask)
+
+    with reopen() as source:
+        camera, prior = _camera(options, source, live)
         if not live:
             read = (options.source, options.camera, options.mask)
-            spare(options.out, [Path(p) for p in read if p is not None], source.folder)
-        camera = _camera(options, source)
-        how = _how(camera, options)
-        if live:
-            warm_up(camera, **how)
-        frames: Any = spool(source, options.out / "frames") if live else source
+            written = FILES if prior is None else (*FILES, CAMERA)
+            spare(options.out, [Path(p) for p in read if p is not None], source.folder, written)
+        how, fps = _how(options), source.fps
         refine = options.filter.refine and not live
         more = {"progress": not options.quiet, "max_frames": options.max_frames, "refine": refine}
-        run = track(frames, camera, **more, **how)
-        fps = source.fps
+        if prior is None:
+            how |= {"settings": _settings(options, camera)}
+            if live:
+                warm_up(camera, **how)
+            frames: Any = spool(source, options.out / "frames") if live else source
+            run = track(frames, camera, **more, **how)
+        else:
+            how |= {"settings": lambda camera, share: _settings(options, camera, share)}
+            run = track_uncalibrated(reopen, camera, prior=prior, **more, **how)
+    camera = run.odometry.camera
     said = {k: str(v) if isinstance(v, Path) else v for k, v in options.flat().items()}
     paths = write_results(run, options.out, said)
     if options.output.recording:
@@ -284,41 +308,59 @@ def _check(options: Track) -> None:
         raise InputError(f"--out {options.out} is a file: give a folder")
 
 
-def _camera(options: Track, source: "FrameSource") -> "Camera":
+def _camera(options: Track, source: "FrameSource", live: bool) -> tuple["Camera", float | None]:
+    """The camera to begin with, and what is known of its focal length where it is to be estimated, as a share of it."""
     from jaxtri.formats import read_camera
     from jaxtri.geometry.camera import Camera
+    from jaxtri.odometry.calibrate import GUESSED
 
     w, h = source.size
-    if options.camera is not None and options.fov is None:
+    refine = options.input.refine_camera
+    if live and (refine or (options.camera is None and options.fov is None)):
+        raise CameraError(
+            "a live camera shows its frames once, so that it cannot be calibrated by them: give --camera FILE, or "
+            "--fov DEGREES; or film a clip with it, track that, and give the camera.json that comes of it"
+        )
+    if options.camera is not None and options.fov is not None:
+        raise CameraError("--camera and --fov both say the focal length: give one of them")
+    if options.camera is not None:
         try:
-            return read_camera(options.camera, width=w, height=h, scale=options.input.scale_camera)
+            camera = read_camera(options.camera, width=w, height=h, scale=options.input.scale_camera)
         except CameraError as error:
             if source.turned_deg not in (90, 270):
                 raise
             said = f"the frames are {w}x{h} because their orientation (EXIF or metadata) turns them by "
             said += f"{source.turned_deg} degrees: calibrate with the turned pictures, or take the orientation out"
             raise CameraError(f"{error}; {said}") from error
-    if options.camera is not None or options.fov is None:
-        raise CameraError("give the intrinsics: --camera FILE, or a guess of the field of view by --fov DEGREES")
-    camera = Camera.from_fov(options.fov, w, h)
+        return camera, FROM_FILE if refine else None
+    camera = Camera.from_fov(USUAL if options.fov is None else options.fov, w, h)
     # The field of view is that of the width; what is stored in pixels that are no squares has another fy.
-    return replace(camera, fy=camera.fx * source.pixel_aspect)
+    camera = replace(camera, fy=camera.fx * source.pixel_aspect)
+    if options.fov is None:
+        return camera, GUESSED
+    return camera, FROM_FOV if refine else None
 
 
-def _how(camera: "Camera", options: Track) -> dict[str, Any]:
-    """The keyword arguments that `odometry.run.track` and `warm_up` have in common."""
-    from jaxtri.odometry.settings import CALIBRATED, Base, Settings, StartSettings
+def _settings(options: Track, camera: "Camera", share: float | None = None) -> "Settings":
+    """Those of a camera; `share` is what its focal length is estimated to, as a share of it."""
+    from jaxtri.odometry.settings import CALIBRATED, Settings
+
+    calibration = options.input.calibration_error
+    if calibration is None:
+        calibration = share or (CALIBRATED if options.fov is None else GUESS)
+    return Settings.of(camera, noise_px=options.tracker.noise_px, calibration=calibration)
+
+
+def _how(options: Track) -> dict[str, Any]:
+    """The keyword arguments that `track`, `track_uncalibrated` and `warm_up` have in common."""
+    from jaxtri.odometry.settings import Base, StartSettings
     from jaxtri.vision.klt import KLTSettings
 
     base = Base(options.filter.base)
     changes = {} if options.tracker.min_parallax is None else {"parallax_deg": options.tracker.min_parallax}
     poselib = options.tracker.starts == "poselib"
-    calibration = CALIBRATED if options.fov is None else GUESS
-    if options.input.calibration_error is not None:
-        calibration = options.input.calibration_error
     return {
         "base": base,
-        "settings": Settings.of(camera, noise_px=options.tracker.noise_px, calibration=calibration),
         "start": StartSettings.of(base, overlap=options.filter.overlap, poselib=poselib, **changes),
         "klt": KLTSettings(capacity=options.tracker.features, find_overlays=options.tracker.find_overlays),
     }

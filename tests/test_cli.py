@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxtri.cli import Track, main
-from jaxtri.formats import read_tum
+from jaxtri.formats import read_camera, read_tum
 from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.trajectory import evaluate
 from jaxtri.vision.video import write_video
@@ -68,6 +68,25 @@ def test_track_writes_everything_and_evaluate_reads_it(sequence, tmp_path, capsy
     assert errors["rotation_rmse_deg"] < 0.1
 
 
+def test_a_camera_that_is_not_known_is_found_and_can_be_given_back(sequence, tmp_path, capsys):
+    out, again = tmp_path / "out", tmp_path / "again"
+    main(["track", str(sequence), "--out", str(out), "--no-overlay", "--quiet"])
+    said = capsys.readouterr()
+    assert "focal length" in said.out
+    statistics = json.loads((out / "run.json").read_text())["statistics"]["calibration"]
+    found, true = read_camera(out / "camera.json"), read_camera(sequence / "camera.json")
+    # The camera slides sideways: that its focal length is hardly seen is said, and the error is of that size.
+    assert abs(np.log(float(found.fx / true.fx))) < 3 * statistics["focal_length_sd_px"] / float(found.fx)
+    assert statistics["determined"] == ("does not determine it" not in said.err)
+    assert statistics["rounds"] in (2, 3)
+    refused = fails(["track", sequence, "--camera", out / "camera.json", "--refine-camera", "--out", out], capsys)
+    assert "overwrite" in refused
+    main(["track", str(sequence), "--camera", str(out / "camera.json"), "--out", str(again), "--no-overlay", "--quiet"])
+    assert not (again / "camera.json").exists()
+    estimate, truth = read_tum(again / "trajectory.txt"), read_tum(sequence / "groundtruth.txt")
+    assert evaluate(estimate, truth).ate_percent < 1
+
+
 def test_starts_by_poselib_are_in_the_record(sequence, tmp_path, monkeypatch):
     """With a stand-in for PoseLib that finds nothing, so that the extra need not be there."""
     nothing = types.SimpleNamespace(R=np.full((3, 3), np.nan), t=np.zeros(3))
@@ -113,7 +132,7 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
     assert "text.mp4" in track(tmp_path / "text.mp4")
     (tmp_path / "empty").mkdir()
     assert "no image" in track(tmp_path / "empty").lower()
-    assert "--camera" in track(sequence, "--max-frames", "5")
+    assert "give one of them" in track(sequence, "--camera", camera, "--fov", "60")
     assert "fov" in track(sequence, "--fov", "190").lower()
     assert "choose one of" in track(sequence, "--camera", camera, "--base", "none")
     assert "at least two" in track(sequence, "--camera", camera, "--max-frames", "1")

@@ -76,7 +76,7 @@ def step(batch: Batch, noise: Noise, now: Estimate, tolerance: Float[Array, ""] 
     The `tolerance` is that of the length of the poses' step, over what they are known to, in the mean of squares of
     their components; and that is judged by the noise that is found, not by the one assumed.
     """
-    return _stepped(batch, noise, now, *_equations(batch, noise, now.poses, now.points, now.damping), tolerance)
+    return _stepped(batch, noise, now, *normal_equations(batch, noise, now.poses, now.points, now.damping), tolerance)
 
 
 @jax.jit
@@ -90,7 +90,7 @@ def _stepped(
 ) -> Estimate:
     x = Factors.of(equations, now.damping).solve(equations.pull)
     each = x.reshape(-1, 6)
-    poses = _moved(batch, now.poses, each)
+    poses = moved_poses(batch, now.poses, each)
 
     def moved(chunk: Chunk, points: Points) -> tuple[Points, Array]:
         said = chunk.said(noise, now.poses, points)
@@ -158,7 +158,7 @@ class KnownPoints(NamedTuple):
 
 def known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Known:
     """The covariances at an estimate."""
-    _, equations = _equations(batch, noise, poses, points, jnp.zeros((), noise.sigma.dtype))
+    _, equations = normal_equations(batch, noise, poses, points, jnp.zeros((), noise.sigma.dtype))
     return _known(batch, noise, poses, points, equations)
 
 
@@ -176,7 +176,7 @@ def _known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], e
     for layer, pull in zip(batch.layers, pulls, strict=True):
         border = border.at[layer.begin[:, None] + jnp.arange(pull.shape[1])].add(pull)
     factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
-    free, b = _free(batch, poses), batch.layers[-1].size
+    free, b = free_errors(batch, poses), batch.layers[-1].size
     blocks = factors.covariances().reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)]
     each = blocks.swapaxes(0, 1).reshape(-1, 6, 6)
     border = jnp.einsum("kab,kbp->kap", free, border)
@@ -193,14 +193,14 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
     """
     still = jax.lax.stop_gradient
     poses, points = still(found.poses), still(found.points)
-    free = _free(batch, poses)
+    free = free_errors(batch, poses)
 
     def only(x: Array) -> Array:
         return jnp.einsum("kab,kb->ka", free, x)
 
     def slope(errors: tuple, batch: Batch, noise: Noise) -> tuple:
         def objective(errors: tuple) -> Array:
-            moved = _moved(batch, poses, only(errors[0]))
+            moved = moved_poses(batch, poses, only(errors[0]))
             new = tuple(jax.vmap(Points.moved)(p, e) for p, e in zip(points, errors[1], strict=True))
 
             # Those behind the last one too: a loop of as many as there are has no reverse derivative.
@@ -240,7 +240,7 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
 
     newton = root(tree(solve(flat)))
     new = tuple(jax.vmap(Points.moved)(p, -e) for p, e in zip(points, newton[1], strict=True))
-    return _moved(batch, poses, -only(newton[0])), new
+    return moved_poses(batch, poses, -only(newton[0])), new
 
 
 def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) -> Callable[[tuple], tuple]:
@@ -251,7 +251,7 @@ def _root(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...]) ->
         return reduced.root, reduced.cross
 
     none = jnp.zeros((), noise.sigma.dtype)
-    _, equations = _equations(batch, noise, poses, points, none)
+    _, equations = normal_equations(batch, noise, poses, points, none)
     factors = Factors.of(equations, none)
     reduced = batch.mapped(one, points)
 
@@ -272,7 +272,7 @@ def _sum(each: Iterable[Array]) -> Float[Array, ""]:
 
 
 @jax.jit  # for eager callers: compiled once, for steps and for covariances
-def _equations(
+def normal_equations(
     batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], damping: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Tridiagonal]:
     """The cost, and what all chunks say of the poses, in the blocks of the last layer, with the gauge held."""
@@ -304,12 +304,12 @@ def _equations(
         total = jax.lax.fori_loop(0, layer.chunks, add, total)
     before, rows, pull = total
     own, above = jnp.triu(rows[:, :, :s]), rows[:-1, :, s:]
-    free = _free(batch, poses).reshape(m, size, 6, 6)
+    free = free_errors(batch, poses).reshape(m, size, 6, 6)
     diagonal, pull = jax.vmap(held)(free, own + jnp.triu(own, 1).swapaxes(1, 2), pull.reshape(m, s))
     return before, Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], above, free[1:]), pull)
 
 
-def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:
+def moved_poses(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:
     """The poses moved by errors that are free: what is given stays so, and not only to first order."""
     moved = jax.vmap(retract)(poses, x)
 
@@ -324,7 +324,7 @@ def _moved(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:
     return jax.tree.map(lambda x, y: x.at[batch.farthest].set(y), moved, far)
 
 
-def _free(batch: Batch, poses: SE3) -> Float[Array, "k 6 6"]:
+def free_errors(batch: Batch, poses: SE3) -> Float[Array, "k 6 6"]:
     """Projections on what the gauge leaves of the poses' errors; empty places have none."""
     k = len(batch.present)
     first = jax.tree.map(lambda x: x[0], poses)

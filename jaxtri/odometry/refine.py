@@ -18,24 +18,20 @@ from tqdm import tqdm
 from jaxtri.compilation import capacity
 from jaxtri.errors import InputError
 from jaxtri.estimation import batch
-from jaxtri.estimation.batch import Estimate
-from jaxtri.estimation.bundle import Looks, PointPrior, Views, looks, seen_from
-from jaxtri.estimation.bundle import Points as Homogeneous
-from jaxtri.estimation.layers import Batch, Layer, Noise, part_of
+from jaxtri.estimation.layers import Noise
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import adjoint, exp_pose, local, multiply, relative
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.motion import Twist
+from jaxtri.odometry.adjustment import FEWEST, Adjustment
 from jaxtri.odometry.driver import Odometry
-from jaxtri.odometry.measuring import doubts, median
+from jaxtri.odometry.measuring import doubts
 from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.settings import Settings, Status
-from jaxtri.odometry.stretches import Pieces, Segment, keyframes, room, segments
+from jaxtri.odometry.stretches import Pieces, Segment, keyframes, segments
 from jaxtri.odometry.structure import Points, world_points
-from jaxtri.odometry.window import FAREST, NEAREST, VAGUE
 from jaxtri.trajectory import Trajectory
 
-FEWEST = 3  # keyframes that there must be: two are what a start has made of them
 TOGETHER = 64  # frames that are measured by one call
 MOST = 50  # steps; a dozen are usual
 TINY = 1e-12  # a weight that is none
@@ -141,16 +137,9 @@ class _Adjusted:
         cls, settings: Settings, over: float, segment: Segment, keys: np.ndarray, progress: bool
     ) -> "_Adjusted | None":
         """Those of a stretch, whose settings have a noise of `over` what was assumed; None if nothing finite came."""
-        pieces = Pieces.of(segment, keys)
-        dtype, k = segment.u.dtype, room(len(keys))
-        centre = -np.einsum("kji,kj->ki", segment.T[keys, :3, :3], segment.T[keys, :3, 3])
-        farthest = int(np.argmax(np.linalg.norm(centre - centre[0], axis=1)))
-        T = np.concatenate([segment.T[keys], np.broadcast_to(np.eye(4), (k - len(keys), 4, 4))]).astype(dtype)
-        poses = SE3.from_matrix(jnp.asarray(T))
-        layers, points, depth = _begun(settings, jax.tree.map(jnp.asarray, pieces.layers), poses)
-        problem = Batch(layers, jnp.arange(k) < len(keys), jnp.asarray(farthest))
-        noise = Noise(settings.sigma, settings.robust.scale.astype(dtype), settings.correlation)
-        now, costs = Estimate.of(poses, points), []
+        begun = Adjustment.of(settings, segment, keys)
+        pieces, problem, noise = begun.pieces, begun.problem, begun.noise
+        now, costs = begun.estimate, []
         bar = tqdm(total=MOST, unit="step", desc="refine", disable=None if progress else True, leave=False)
         while not bool(now.done) and len(costs) < MOST:
             now = batch.step(problem, noise, now)
@@ -183,7 +172,7 @@ class _Adjusted:
         owed = float(settings.calibration) ** 2 * response @ response.swapaxes(1, 2)
         poses = now.poses, covariance * inflation + owed
         looks = pieces.looks(residual, (2,)), distance / inflation
-        return cls(segment, keys, pieces, noise, float(depth), *poses, X, spread, agreed, *looks, said)
+        return cls(segment, keys, pieces, noise, begun.depth, *poses, X, spread, agreed, *looks, said)
 
     def points(self, settings: Settings, moved: np.ndarray) -> Points:
         """The points that at least two looks agree on, in a world that has been moved."""
@@ -295,33 +284,6 @@ def _over_found(distance: np.ndarray, agree: np.ndarray) -> np.ndarray:
 
 
 _matrices = jax.jit(SE3.as_matrix)
-
-
-@jax.jit
-def _begun(
-    settings: Settings, layers: list[tuple[Array, ...]], poses: SE3
-) -> tuple[tuple[Layer, ...], tuple[Homogeneous, ...], Float[Array, ""]]:
-    """The layers, the points by the first and last look at them, and the median depth of the scene."""
-    found = []
-    for observed, mask, begin, _ in layers:
-
-        def one(part: tuple[Array, ...]) -> Looks:
-            observed, mask, begin = part
-            return looks(part_of(poses, begin, len(mask)), Views(observed, mask))
-
-        found.append(jax.lax.map(one, (observed, mask, begin)))
-    rho, angle = (jnp.concatenate([getattr(f, name).ravel() for f in found]) for name in ("inverse_depth", "angle"))
-    wide = (angle > settings.usable_parallax) & (rho > 0)
-    depth = median(1 / jnp.where(wide, rho, 1.0), wide)
-
-    def start(first: Looks, layer: tuple[Array, ...]) -> tuple[Layer, Homogeneous]:
-        rho = jnp.clip(first.inverse_depth, FAREST / depth, NEAREST / depth)
-        prior = PointPrior(jnp.full_like(rho, 1 / depth), jnp.full_like(rho, VAGUE / depth))
-        observed, mask, begin, chunks = layer
-        return Layer(observed, mask, begin, chunks, prior), jax.vmap(seen_from)(first.R, first.T, first.u, rho)
-
-    begun, points = zip(*map(start, found, layers), strict=True)
-    return begun, points, depth
 
 
 @jax.jit

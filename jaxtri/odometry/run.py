@@ -19,6 +19,7 @@ from jaxtri.compilation import capacity
 from jaxtri.errors import CameraError, InputError, InputWarning
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
+from jaxtri.odometry.calibrate import Calibration
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.poses import FramePose
 from jaxtri.odometry.refine import Refinement
@@ -43,6 +44,8 @@ class Run(Archived):
         odometry: What the filters said of every frame.
         statistics: Figures of the run, as `run.json` has them.
         refined: What came of all frames together, where that was asked for.
+        calibration: The camera from its own video, where it was not known (`track_uncalibrated`).
+        track_colours: RGB of every track, where it was first seen.
     """
 
     trajectory: Trajectory
@@ -51,6 +54,8 @@ class Run(Archived):
     odometry: Odometry
     statistics: dict[str, object] = field(default_factory=dict)
     refined: Refinement | None = None
+    calibration: Calibration | None = None
+    track_colours: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def poses(self) -> list[FramePose]:
@@ -123,21 +128,35 @@ def track(
         bar.close()
     if len(odometry.poses) < 2:
         raise InputError(f"{len(odometry.poses)} frame: a camera's motion needs at least two")
-    causal, refined = odometry.trajectory(), None
+    causal = odometry.trajectory()
     clock.end()
-    best = causal
-    if refine:
-        with clock.part("refinement"):
-            refined = refine_run(odometry, progress=progress)
-            best = refined.trajectory()
-    points = odometry.points() if refined is None else refined.points
+    statistics = _statistics(odometry, odometry.poses) | clock.statistics() | {"interrupted": interrupted}
+    statistics |= {"refined": None, "ignored": _ignored(features)}
+    points = odometry.points()
+    run = Run(causal, points, _coloured(points, colours), odometry, statistics, track_colours=colours)
+    return refined(run, progress=progress) if refine else run
+
+
+def refined(run: Run, *, progress: bool = False) -> Run:
+    """The run with all its keyframes adjusted together: `track(..., refine=True)` ends with it.
+
+    Raises `InputError` where its tracks were not kept (`record`).
+    """
+    clock = _Clock()
+    with clock.part("refinement"):
+        found = refine_run(run.odometry, progress=progress)
+    best, seconds = found.trajectory(), run.statistics["seconds"]
+    assert isinstance(seconds, dict)
+    statistics = run.statistics | _statistics(run.odometry, found.poses)
+    statistics["seconds"] = seconds | {"refinement": clock.seconds["refinement"]}
+    statistics["refined"] = found.statistics | _change(run.odometry.trajectory(), best)
+    colours = _coloured(found.points, run.track_colours)
+    return replace(run, trajectory=best, points=found.points, colours=colours, statistics=statistics, refined=found)
+
+
+def _coloured(points: Points, colours: dict[int, np.ndarray]) -> np.ndarray:
     grey = np.full(3, 128, np.uint8)
-    rgb = np.array([colours.get(int(i), grey) for i in points.ids], np.uint8).reshape(-1, 3)
-    change = None if refined is None else refined.statistics | _change(causal, best)
-    poses = odometry.poses if refined is None else refined.poses
-    statistics = _statistics(odometry, poses) | clock.statistics() | {"interrupted": interrupted, "refined": change}
-    statistics["ignored"] = _ignored(features)
-    return Run(best, points, rgb, odometry, statistics, refined)
+    return np.array([colours.get(int(i), grey) for i in points.ids], np.uint8).reshape(-1, 3)
 
 
 class _Clock:
@@ -165,11 +184,16 @@ class _Clock:
         """The end of the last frame."""
         self._ended = time.perf_counter()
 
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Of each part."""
+        return {k: round(v, 3) for k, v in self._seconds.items()}
+
     def statistics(self) -> dict[str, object]:
         """As `run.json` has them."""
         return {
             "frames_per_second": len(self._milliseconds) / (self._ended - self._began),
-            "seconds": {k: round(v, 3) for k, v in self._seconds.items()},
+            "seconds": self.seconds,
             "milliseconds_of_frame": [round(m, 2) for m in self._milliseconds],
         }
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.driver import Odometry, normalise
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.slots import Slotted
@@ -38,11 +39,11 @@ class Segment(NamedTuple):
     measured: np.ndarray  # (t,) frames whose pose comes from what they show
 
     @classmethod
-    def of(cls, odometry: Odometry, first: int, end: int) -> "Segment":
-        """Of frames of a run, as it recorded them."""
+    def of(cls, odometry: Odometry, first: int, end: int, camera: Camera | None = None) -> "Segment":
+        """Of frames of a run, as it recorded them; as seen by another camera, where one is given."""
         tracks: list[Slotted] = odometry.tracks[first:end]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
-        u = np.stack([np.asarray(normalise(odometry.camera, t.pixels.astype(dtype))) for t in tracks])
+        u = np.stack([np.asarray(normalise(camera or odometry.camera, t.pixels.astype(dtype))) for t in tracks])
         seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
         poses = odometry.poses[first:end]
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from jaxtri.odometry.calibrate import Calibration
 from jaxtri.odometry.run import Run
 from jaxtri.trajectory import Evaluation
 
@@ -26,6 +27,8 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
         frame, words = next(iter(doubts.items()))
         more = f", the first of {len(doubts)}" if len(doubts) > 1 else ""
         lines.append(f"frame {frame}{more}, is uncertain: {'; '.join(words)} (run.json has them all)")
+    if run.calibration is not None:
+        lines.append(_camera(run.calibration))
     lines += _ignored(s["ignored"])
     refined = s["refined"]
     if isinstance(refined, dict):
@@ -40,6 +43,16 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
     if s["interrupted"]:
         lines.append("interrupted: these are the frames up to there")
     return "\n".join([*lines, *(f"  {path}" for path in paths)])
+
+
+def _camera(found: Calibration) -> str:
+    """A line on the camera that was estimated."""
+    fx = float(found.camera.fx)
+    said = f"focal length {fx:.5g} +- {fx * found.focal_sd:.2g} pixels ({found.field_of_view_deg:.3g} degrees across)"
+    if found.radial_sd and found.camera.distortion is not None:
+        radial = zip(("k1", "k2"), found.camera.distortion.coefficients.tolist(), found.radial_sd, strict=False)
+        said += "".join(f", {name} {k:.3f} +- {sd:.2g}" for name, k, sd in radial)
+    return f"{said}: {'from the video' if found.determined else 'NOT determined by this motion'}"
 
 
 def _ignored(ignored: object) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxtri.errors import InputError
-from jaxtri.formats import atomic_path, write_json, write_ply, write_tum
+from jaxtri.formats import atomic_path, write_camera, write_json, write_ply, write_tum
 from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.run import Run
 from jaxtri.odometry.settings import Status
@@ -33,16 +33,19 @@ FILES = (
     "recording.rrd",
 )
 """Everything that a run may write into its folder."""
+CAMERA = "camera.json"
+"""What a run writes beside that where it estimates the camera, too."""
 
 
-def spare(out: Path, inputs: Iterable[Path], frames: Path | None) -> None:
+def spare(out: Path, inputs: Iterable[Path], frames: Path | None, written: Iterable[str] = FILES) -> None:
     """Make sure that the results of a run, written to `out`, leave what it reads as it is.
 
-    `inputs` are files or folders that it reads; `frames` is the folder that holds the images, if there are any. Raises
-    `InputError` where results would take the place of an input, or stand where the images of the source are looked for.
+    `inputs` are files or folders that it reads; `frames` is the folder that holds the images, if there are any;
+    `written` are the names of the results. Raises `InputError` where results would take the place of an input, or
+    stand where the images of the source are looked for.
     """
     for path in inputs:
-        if any((out / name).exists() and path.exists() and (out / name).samefile(path) for name in FILES):
+        if any((out / name).exists() and path.exists() and (out / name).samefile(path) for name in written):
             raise InputError(f"--out {out}: the results would overwrite {path}, which is read; give another folder")
         places = () if frames is None else (frames.resolve(), *frames.resolve().parents)
         if path.is_dir() and out.resolve() in (p for p in places if p.is_relative_to(path.resolve())):
@@ -62,7 +65,8 @@ def write_results(
 ) -> list[Path]:
     """Write trajectory.txt, trajectory.png, points.ply and run.json; returns their paths.
 
-    Where the run was refined, trajectory_causal.txt beside them has what the filter made of each frame at its time.
+    Where the camera was estimated, too, camera.json beside them has it, for `--camera` and other tools. Where the run
+    was refined, trajectory_causal.txt beside them has what the filter made of each frame at its time.
     `reference` is the truth in the frame and scale of the run, for the plot.
     """
     paths = [out / name for name in ("trajectory.txt", "trajectory.png", "points.ply", "run.json")]
@@ -87,6 +91,9 @@ def write_results(
         figure.savefig(temporary, dpi=120)
     sd = np.sqrt(np.linalg.eigvalsh(run.points.covariance)[:, -1]) if len(run.points.ids) else np.zeros(0)
     write_ply(out / "points.ply", run.points.xyz, run.colours, {"sd": sd})
+    if run.calibration is not None:
+        paths.append(out / CAMERA)
+        write_camera(paths[-1], run.calibration.camera)
     write_json(out / "run.json", {"settings": settings, "versions": versions(), "statistics": run.statistics})
     return paths
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,12 +7,14 @@ import pytest
 from intervals import nees_interval
 from jaxlie import SE3
 
-from jaxtri.estimation import batch
+from jaxtri.estimation import batch, calibration
 from jaxtri.estimation.batch import Estimate
 from jaxtri.estimation.bundle import PointPrior, Views, linearise, looks, reduce, seen_from
 from jaxtri.estimation.layers import Batch, Layer, Noise
 from jaxtri.estimation.precision import block_diagonal
 from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
+from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.lenses import BrownConrady
 from jaxtri.geometry.pose import matrix, retract
 
 K, SMALL, LARGE = 16, 2, 4  # places, of which the last two are empty; blocks of two layers
@@ -159,6 +163,58 @@ def test_what_an_error_of_the_calibration_does_to_the_poses():
     expected = jnp.einsum("kep,p->ke", response, error)
     assert abs(expected).max() > 1e-6
     np.testing.assert_allclose(found[:SEEN], expected[:SEEN], atol=1e-3 * abs(expected).max())
+
+
+def test_what_is_told_of_the_intrinsics():
+    """Against the optimum of other intrinsics: its cost is a parabola, whose slope and poses are known beforehand."""
+    problem, poses, _ = made()
+    camera = Camera.from_parameters(500.0, 500.0, 320.0, 240.0, distortion=BrownConrady.from_coefficients([-0.1]))
+    start = begun(problem, poses)
+    by = np.array([2e-3, -1e-3, 1e-3, -1e-3, 2e-3])  # log of the focal length, principal point over it, k1, k2
+
+    def seen(sign):
+        other = calibration.changed(camera, jnp.asarray(sign * by))
+        np.testing.assert_allclose(calibration.difference(camera, other), sign * by, atol=1e-12)
+
+        def again(layer):
+            pixels = camera.to_pixels(jnp.moveaxis(layer.observed, 1, -1))
+            return layer._replace(observed=jnp.moveaxis(other.to_normalised(pixels), -1, 1))
+
+        return problem._replace(layers=tuple(map(again, problem.layers))), other
+
+    def best(problem):
+        return optimum(problem, PLAIN, poses, start, tolerance=1e-9, most=60)
+
+    # What was seen is exact: the least cost is that of the change, and the pull leads back.
+    exact = calibration.told(problem, PLAIN, poses, start, camera)
+    information = exact.information
+    told, found = [], []
+    for sign in (-1.0, 1.0):
+        moved, other = seen(sign)
+        found.append(best(moved))
+        told.append(calibration.told(moved, PLAIN, found[-1].poses, found[-1].points, other))
+    costs = np.array([float(f.cost) for f in found])
+    np.testing.assert_allclose(costs.mean(), by @ information @ by, rtol=2e-2)
+    pull = (told[0].pull - told[1].pull) / 2
+    np.testing.assert_allclose(pull, information @ by, atol=2e-2 * abs(information @ by).max())
+    np.testing.assert_allclose(sum(s.sum(axis=(0, 2)) for s in told[0].scores), told[0].pull)
+    moved = jax.vmap(lambda a, b: (a @ b.inverse()).log())(found[1].poses, found[0].poses) / 2
+    expected = jnp.einsum("kep,p->ke", exact.response, by)
+    np.testing.assert_allclose(moved[:SEEN], expected[:SEEN], atol=2e-2 * abs(expected).max())
+
+
+@pytest.mark.parametrize("lens", [None, [-0.25, 0.05], [0.1, 0.02, 1e-3, -1e-3]])
+def test_where_a_pixel_is_seen_by_other_intrinsics(lens):
+    camera = Camera.from_parameters(500.0, 480.0, 320.0, 240.0)
+    if lens is not None:
+        camera = replace(camera, distortion=BrownConrady.from_coefficients(lens))
+    u = jnp.asarray(np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2)))
+    pixels, p = camera.to_pixels(u), calibration.unknown(camera)
+    assert p == (3 if lens is None else 5)
+    step = 1e-6
+    for i, by in enumerate(np.eye(p) * step):
+        low, high = (calibration.changed(camera, jnp.asarray(x)).to_normalised(pixels) for x in (-by, by))
+        np.testing.assert_allclose(calibration.slope(camera, u)[..., i], (high - low) / (2 * step), atol=1e-6)
 
 
 def test_covariances_are_those_of_the_errors():
