@@ -93,9 +93,11 @@ def calibrate(
 
     Of the longest stretch over which the camera was followed. `guess` is what was thought of the camera before anything
     was seen, by default `odometry.camera`, and `prior` the standard deviation of its focal length, as a share of it;
-    that of the principal point is 2 % of the width, that of k1 and k2 .2 and .1. Standard deviations
-    are the largest of those by the noise that is assumed and by what tracks, times and parts of the picture disagree on
-    (White 1980), and count what no track shows: 1.5 % of the focal length.
+    that of the principal point is 2 % of the width, that of k1 and k2 .2 and .1.
+
+    Standard deviations are the largest of those by the noise that is assumed and by what tracks, times and parts of the
+    picture disagree on (White 1980). Those of the focal length and the principal point count 1.5 % of the focal length,
+    which no track shows.
 
     The poses were followed with the camera as it was. Where it has changed much, track again with the new one, and
     estimate once more: `track_uncalibrated` does. Raises `InputError` where no tracks were kept,

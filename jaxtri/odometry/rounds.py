@@ -37,11 +37,12 @@ def track_uncalibrated(
     `track`. The intrinsics are `run.odometry.camera`, and `run.calibration` says how well they are known; where the
     motion does not determine the focal length an `InputWarning` says so.
 
-    Raises what `track` raises; `InitialisationError` only where no motion is found with a shorter and a longer focal
-    length either.
+    An interrupt (Ctrl-C) ends the sequence there, for all rounds. Raises what `track` raises; `InitialisationError`
+    only where no motion is found with a shorter and a longer focal length either.
     """
     make = settings or (lambda camera, share: Settings.of(camera, calibration=share))
     guess, share, found, run, number, most = camera, min(prior, TOLERATED), None, None, 0, max(rounds, 2)
+    interrupted = False
     for number in range(1, most + 1):
         try:
             run = _tracked(reopen, guess, make, share, progress, **how)
@@ -50,13 +51,16 @@ def track_uncalibrated(
                 raise
             run = _otherwise(error, reopen, guess, make, share, progress, **how)
             guess = run.odometry.camera
+        if run.statistics["interrupted"]:  # the clip ends there, for the rounds to come, too
+            interrupted, how = True, how | {"max_frames": len(run.poses)}
         found = calibrate(run.odometry, guess=camera, prior=prior, progress=progress)
         if number == most or (number > 1 and found.shift(guess) < found.focal_sd):
             break
         guess, share = found.camera, found.focal_sd
     assert run is not None
     assert found is not None
-    found = replace(found, camera=guess)
+    # It was tracked with the camera before the last estimate: nearly the same, or not known to more than that.
+    found = replace(found, camera=guess, focal_sd=max(found.focal_sd, found.shift(guess)))
     if not found.determined:
         warnings.warn(
             f"the focal length is {float(guess.fx):.0f} pixels, give or take {found.focal_sd:.0%}: the motion does not "
@@ -65,8 +69,8 @@ def track_uncalibrated(
             InputWarning,
             stacklevel=2,
         )
-    said = found.statistics() | {"rounds": number}
-    run = replace(run, calibration=found, statistics=run.statistics | {"calibration": said})
+    said = {"interrupted": interrupted, "calibration": found.statistics() | {"rounds": number}}
+    run = replace(run, calibration=found, statistics=run.statistics | said)
     return refined(run, progress=progress) if refine else run
 
 

@@ -1,0 +1,95 @@
+"""The rounds of a camera that is not known, their parts replaced; whole ones are in `tests/test_cli.py`."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxtri.errors import InitialisationError, InputWarning
+from jaxtri.geometry.camera import Camera
+from jaxtri.odometry import rounds
+from jaxtri.odometry.calibrate import Calibration
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.poses import FramePose
+from jaxtri.odometry.run import Run
+from jaxtri.odometry.settings import Settings, Status
+from jaxtri.odometry.structure import no_points
+from jaxtri.trajectory import Trajectory
+
+FIRST = Camera.from_fov(60, 640, 480)
+
+
+def at(focal, sd=0.02):
+    return Calibration(
+        replace(FIRST, fx=FIRST.fx * 0 + focal, fy=FIRST.fy * 0 + focal), sd, (6.0, 6.0), (0.01, 0.01), 9
+    )
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    """What each round finds, and what it was called with."""
+    parts = SimpleNamespace(found=[], cameras=[], shares=[], how=[], interrupted=[], fails=lambda focal: False)
+
+    def track(source, camera, *, settings, record, progress, **how):
+        assert record
+        parts.cameras.append(float(camera.fx))
+        parts.how.append(how)
+        if parts.fails(float(camera.fx)):
+            raise InitialisationError("no motion")
+        interrupted = parts.interrupted.pop(0) if parts.interrupted else False
+        odometry = Odometry(camera)
+        odometry.poses = [FramePose(float(k), Status.TRACKING) for k in range(7)]
+        standing = Trajectory(np.arange(7.0), np.tile(np.eye(4), (7, 1, 1)))
+        return Run(standing, no_points(), np.zeros((0, 3), np.uint8), odometry, {"interrupted": interrupted})
+
+    monkeypatch.setattr(rounds, "track", track)
+    monkeypatch.setattr(rounds, "calibrate", lambda *_, **__: parts.found.pop(0))
+
+    def go(**options):
+        def settings(camera, share):
+            parts.shares.append(share)
+            return Settings.of(camera)
+
+        return rounds.track_uncalibrated(lambda: nullcontext([]), FIRST, settings=settings, refine=False, **options)
+
+    parts.go = go
+    return parts
+
+
+def test_they_end_where_the_camera_stays(parts):
+    parts.found = [at(500.0), at(503.0)]
+    run = parts.go()
+    assert parts.cameras == [pytest.approx(float(FIRST.fx)), 500.0]
+    assert parts.shares == [rounds.TOLERATED, 0.02]
+    # What it was tracked with is what is said.
+    assert float(run.calibration.camera.fx) == 500.0
+    assert run.calibration.focal_sd == 0.02
+    assert run.statistics["calibration"]["rounds"] == 2
+    assert run.statistics["calibration"]["focal_length_px"] == 500.0
+
+
+def test_what_does_not_settle_is_known_no_better(parts):
+    parts.found = [at(500.0), at(560.0), at(650.0)]
+    with pytest.warns(InputWarning, match="560 pixels, give or take 1[5-9]%.*does not determine"):
+        run = parts.go()
+    assert run.calibration.focal_sd > 0.14
+    assert not run.statistics["calibration"]["determined"]
+
+
+def test_an_interrupt_ends_the_clip_there(parts):
+    parts.found, parts.interrupted = [at(500.0), at(500.0)], [True]
+    run = parts.go()
+    assert parts.how == [{}, {"max_frames": 7}]
+    assert run.statistics["interrupted"]
+
+
+def test_other_focal_lengths_are_tried_where_there_is_no_motion(parts):
+    parts.found, parts.fails = [at(1200.0), at(1200.0)], lambda focal: focal < 1000
+    run = parts.go()
+    assert len(parts.cameras) == 4
+    assert float(run.calibration.camera.fx) == 1200.0
+    parts.fails = lambda focal: True
+    with pytest.raises(InitialisationError, match="no motion"):
+        parts.go()
