@@ -4,8 +4,8 @@ from tracks import make, sideways
 
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.estimation import batch
+from jaxtri.odometry import adjustment, stretches
 from jaxtri.odometry import refine as module
-from jaxtri.odometry import stretches
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.refine import refine
 from jaxtri.odometry.run import follow_tracks
@@ -116,7 +116,7 @@ def test_long_sequences_are_cut_into_blocks(run, monkeypatch):
 
 def test_another_sequence_compiles_nothing(run):
     """Other frames, keyframes, tracks and looks: what one refinement has compiled serves the next one."""
-    programs = batch._equations, batch._stepped, batch._known, module._begun, module._measured
+    programs = batch.normal_equations, batch._stepped, batch._known, adjustment._begun, module._measured
     first = refine(run[1])
     compiled = [program._cache_size() for program in programs]
     assert all(compiled)

@@ -105,7 +105,8 @@ def test_a_field_of_view_heeds_pixels_that_are_no_squares(tmp_path):
     change_mp4(tmp_path / "a.mp4", aspect=(64, 45))
     source = open_source(tmp_path / "a.mp4")
     assert (square.pixel_aspect, source.pixel_aspect) == (1, 64 / 45)
-    camera = _camera(Track(str(tmp_path / "a.mp4"), fov=60.0), source)
+    camera, prior = _camera(Track(str(tmp_path / "a.mp4"), fov=60.0), source, live=False)
+    assert prior is None
     assert float(camera.fx) == pytest.approx(32 / np.tan(np.radians(30)))
     assert float(camera.fy / camera.fx) == pytest.approx(64 / 45)
 
