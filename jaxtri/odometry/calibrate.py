@@ -78,11 +78,15 @@ class Calibration:
         return said
 
     def shift(self, other: Camera) -> float:
-        """How far another camera sees what this one sees at the corner of its picture, as a share of the way there."""
+        """How far another camera sees what this one sees at the corner of its picture, as a share of the way there.
+
+        By its focal length and its lens: a principal point that moves is, nearly, a camera that turns.
+        """
         c = self.camera
         corner = jnp.asarray([c.width or 2 * c.cx, c.height or 2 * c.cy], c.fx.dtype)
         ray, centre = c.to_normalised(corner), jnp.stack([c.cx, c.cy])
-        moved = jnp.linalg.norm(other.to_pixels(ray) - corner) / jnp.linalg.norm(corner - centre)
+        seen = replace(other, cx=c.cx, cy=c.cy).to_pixels(ray)
+        moved = jnp.linalg.norm(seen - corner) / jnp.linalg.norm(corner - centre)
         return max(float(moved), abs(math.log(float(other.fx / c.fx))))
 
 

@@ -52,6 +52,7 @@ def test_exact_tracks_give_the_camera_back(share):
     assert found.shift(found.camera) < 1e-9
     wider = replace(found.camera, fx=found.camera.fx * 1.02, fy=found.camera.fy * 1.02)
     assert found.shift(wider) == pytest.approx(0.02, rel=0.05)
+    assert found.shift(replace(wider, cx=wider.cx + 9)) == found.shift(wider)
 
 
 def test_its_standard_deviation_is_that_of_the_errors():
