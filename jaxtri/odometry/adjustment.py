@@ -1,6 +1,6 @@
 """A stretch of a run as a problem of bundle adjustment: its keyframes, its points, and where to begin."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,23 @@ from jaxtyping import Array, Float
 from jaxtri.estimation.batch import Estimate
 from jaxtri.estimation.bundle import Looks, PointPrior, Points, Views, looks, seen_from
 from jaxtri.estimation.layers import Batch, Layer, Noise, part_of
+from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.measuring import median
 from jaxtri.odometry.settings import Settings
-from jaxtri.odometry.stretches import Pieces, Segment, room
+from jaxtri.odometry.stretches import Pieces, Segment, keyframes, room
 from jaxtri.odometry.window import FAREST, NEAREST, VAGUE
 
 FEWEST = 3  # keyframes that there must be: two are what a start has made of them
+
+
+def stretch(odometry: Odometry, first: int, end: int) -> tuple[Segment, np.ndarray, Settings, float]:
+    """Frames of a run, their keyframes, the settings with the noise that was found, and that over the one assumed."""
+    assert odometry.settings is not None
+    segment = Segment.of(odometry, first, end)
+    noise = float(np.median([p.noise for p in odometry.poses[first:end]]))
+    # Robust weights widen with it, other than in the filter: this is the noise of all, not of a few blurred frames.
+    settings = replace(odometry.settings, sigma=odometry.settings.sigma * noise)
+    return segment, keyframes(settings, segment), settings, noise
 
 
 @dataclass

@@ -11,9 +11,9 @@ from jaxtri.errors import InputError
 from jaxtri.estimation import batch, calibration
 from jaxtri.estimation.batch import Estimate
 from jaxtri.geometry.camera import Camera
-from jaxtri.odometry.adjustment import FEWEST, Adjustment
+from jaxtri.odometry.adjustment import FEWEST, Adjustment, stretch
 from jaxtri.odometry.driver import Odometry
-from jaxtri.odometry.stretches import Pieces, Segment, keyframes, segments
+from jaxtri.odometry.stretches import Pieces, Segment, segments
 
 # What is known beforehand: of the focal length, as a share of it, where it is a guess of what most cameras have (24 to
 # 110 degrees are within one standard deviation of 60); of the principal point, as a share of the width; of k1 and k2.
@@ -110,12 +110,8 @@ def calibrate(
     if not odometry.record:
         raise InputError("nothing was recorded: ask for it by record=True")
     odometry.trajectory()  # takes in what is queued, and raises where there is none
-    assert odometry.settings is not None
     first, end = max(segments(odometry), key=lambda s: s[1] - s[0])
-    segment = Segment.of(odometry, first, end)
-    noise = float(np.median([p.noise for p in odometry.poses[first:end]]))
-    settings = replace(odometry.settings, sigma=odometry.settings.sigma * noise)
-    keys = keyframes(settings, segment)
+    segment, keys, settings, _ = stretch(odometry, first, end)
     camera = calibration.with_lens(odometry.camera)
     about = calibration.difference(camera, camera if guess is None else calibration.with_lens(guess))
     centre = CENTRE * (camera.width or 2 * float(camera.cx)) / float(camera.fx)

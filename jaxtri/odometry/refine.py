@@ -23,12 +23,12 @@ from jaxtri.filters import ekf
 from jaxtri.geometry.pose import adjoint, exp_pose, local, multiply, relative
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.motion import Twist
-from jaxtri.odometry.adjustment import FEWEST, Adjustment
+from jaxtri.odometry.adjustment import FEWEST, Adjustment, stretch
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.measuring import doubts
 from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.settings import Settings, Status
-from jaxtri.odometry.stretches import Pieces, Segment, keyframes, segments
+from jaxtri.odometry.stretches import Pieces, Segment, segments
 from jaxtri.odometry.structure import Points, world_points
 from jaxtri.trajectory import Trajectory
 
@@ -71,17 +71,12 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
     if not odometry.record:
         raise InputError("nothing was recorded: ask for it by record=True")
     odometry.trajectory()  # takes in what is queued, and raises where there is none
-    assert odometry.settings is not None
     poses, points, chosen, parts = list(odometry.poses), [], [], []
     moved = np.eye(4)  # of the world, by what was refined before
     at = 0
     for first, end in segments(odometry):
         poses[at:first] = [_in(pose, moved) for pose in poses[at:first]]
-        segment = Segment.of(odometry, first, end)
-        noise = float(np.median([p.noise for p in odometry.poses[first:end]]))
-        # Robust weights widen with it, other than in the filter: this is the noise of all, not of a few blurred frames.
-        settings = replace(odometry.settings, sigma=odometry.settings.sigma * noise)
-        keys = keyframes(settings, segment)
+        segment, keys, settings, noise = stretch(odometry, first, end)
         last = poses[end - 1].T_camera_world
         found = _Adjusted.of(settings, noise, segment, keys, progress) if len(keys) >= FEWEST else None
         if found is None:
