@@ -33,6 +33,13 @@ jax.config.update("jax_enable_x64", True)
 # Strict promotion is not to be had: jaxlie multiplies its integer tables with floats.
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget():
+    """Compiled programs are let go of with each file: each has some of the process's maps, and Linux gives 65,530."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def key():
     return jax.random.key(0)
