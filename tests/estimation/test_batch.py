@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxtri.estimation.precision import block_diagonal
 from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.lenses import BrownConrady
-from jaxtri.geometry.pose import matrix, retract
+from jaxtri.geometry.pose import retract
 
 K, SMALL, LARGE = 16, 2, 4  # places, of which the last two are empty; blocks of two layers
 SEEN, FARTHEST, SIGMA = 14, 13, 1e-3
@@ -23,17 +24,35 @@ NOISE = Noise(jnp.asarray(SIGMA), jnp.asarray(16.0), jnp.asarray(0.8))
 PLAIN = Noise(jnp.asarray(SIGMA), jnp.asarray(1e9), jnp.asarray(0.8))
 
 
+# Compiled once for the file: every problem is of one size.
+optimum = jax.jit(partial(batch.optimum, most=60))
+known = jax.jit(batch.known)
+matrices = jax.jit(SE3.as_matrix)
+
+
+@jax.jit
+def between(to, of):
+    """Errors of poses."""
+    return jax.vmap(lambda a, b: (a @ b.inverse()).log())(to, of)
+
+
+@jax.jit
+def moved_by(poses, errors):
+    return jax.vmap(retract)(poses, errors)
+
+
 def camera_path():
     t = np.arange(K)[:, None]
     errors = np.concatenate([-t * [0.15, 0.01, 0.02], 0.05 * np.sin(t / 3) * [0.3, 1.0, 0.5]], axis=1)
-    return jax.vmap(lambda e: retract(SE3.identity(), e))(jnp.asarray(errors))
+    return moved_by(SE3.identity((K,)), jnp.asarray(errors))
 
 
 def made(noise=0.0, seed=0):
     """A path before points; short and long tracks, each in the layer that holds it. The truth beside it."""
     rng = np.random.default_rng(1)
     poses = camera_path()
-    R, T = np.asarray(jax.vmap(lambda p: matrix(p.rotation()))(poses)), np.asarray(poses.translation())
+    M = np.asarray(matrices(poses))
+    R, T = M[:, :3, :3], M[:, :3, 3]
     layers, truth, draw = [], [], np.random.default_rng(seed)
     for size, n in ((SMALL, 10), (LARGE, 8)):
         # Two chunks begin with the last block but one, and behind them stands what is not counted.
@@ -59,6 +78,7 @@ def made(noise=0.0, seed=0):
     return Batch(tuple(layers), jnp.arange(K) < SEEN, jnp.asarray(FARTHEST)), poses, truth
 
 
+@jax.jit
 def begun(problem, poses):
     """Points by their first and last look."""
 
@@ -74,25 +94,26 @@ def begun(problem, poses):
 def off(poses, size, seed=3):
     errors = np.random.default_rng(seed).normal(size=(K, 6)) * size
     errors[0] = 0
-    return jax.vmap(retract)(poses, jnp.asarray(errors))
-
-
-optimum = jax.jit(batch.optimum, static_argnames=("most",))
+    return moved_by(poses, jnp.asarray(errors))
 
 
 def test_the_equations_are_those_of_all_tracks_in_one_piece():
     """Blocks, layers, gauge and covariances: against one dense matrix of every pose."""
     problem, poses, _ = made(noise=1.0)
     points = begun(problem, poses)
+
+    @jax.jit
+    def reduced(observed, mask, chunk, prior):
+        said = linearise(poses, chunk, Views(observed, mask, NOISE.correlation), *NOISE[:2])
+        return reduce(said, chunk, prior)
+
     dense, pull = np.zeros((6 * K, 6 * K)), np.zeros(6 * K)
     for layer, p in zip(problem.layers, points, strict=True):
         for c in range(int(layer.chunks)):
             observed, mask = np.zeros((2, K, layer.mask.shape[2])), np.zeros((K, layer.mask.shape[2]), bool)
             rows = slice(layer.begin[c], layer.begin[c] + 2 * layer.size)
             observed[:, rows], mask[rows] = layer.observed[c], layer.mask[c]
-            views = Views(jnp.asarray(observed), jnp.asarray(mask), NOISE.correlation)
-            chunk, prior = jax.tree.map(lambda x, c=c: x[c], (p, layer.prior))
-            said = reduce(linearise(poses, chunk, views, *NOISE[:2]), chunk, prior)
+            said = reduced(observed, mask, *jax.tree.map(lambda x, c=c: np.asarray(x)[c], (p, layer.prior)))
             dense, pull = dense + said.information, pull + said.pull
     # The first pose is given, and the distance of the one that is farthest; empty places have no errors.
     free = np.ones((K, 6, 6)) * np.eye(6)
@@ -101,16 +122,16 @@ def test_the_equations_are_those_of_all_tracks_in_one_piece():
     free[FARTHEST, :3, :3] -= np.outer(along, along) / (along @ along)
     P = np.asarray(block_diagonal(jnp.asarray(free)))
     covariance = np.linalg.pinv(P @ dense @ P, rcond=1e-11, hermitian=True)
-    known = jax.jit(batch.known)(problem, NOISE, poses, points)
+    said = known(problem, NOISE, poses, points)
     own = covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
-    np.testing.assert_allclose(known.covariance, own, rtol=1e-5, atol=1e-7 * own.max())
+    np.testing.assert_allclose(said.covariance, own, rtol=1e-5, atol=1e-7 * own.max())
     # One step, undamped, is that of the dense equations.
     now = Estimate.of(poses, points)._replace(damping=jnp.asarray(0.0))
-    after = jax.jit(batch.step)(problem, PLAIN, now)
-    moved = jax.jit(batch.step)(problem, NOISE, now)
+    step = jax.jit(batch.step)
+    after, moved = step(problem, PLAIN, now), step(problem, NOISE, now)
     assert after.cost < 1e6
     x = P @ np.linalg.pinv(P @ dense @ P, rcond=1e-11, hermitian=True) @ P @ pull
-    expected = np.array(jax.vmap(retract)(poses, jnp.asarray(x.reshape(K, 6))).wxyz_xyz)
+    expected = np.array(moved_by(poses, jnp.asarray(x.reshape(K, 6))).wxyz_xyz)
     expected[FARTHEST, 4:] *= np.linalg.norm(along) / np.linalg.norm(expected[FARTHEST, 4:])  # given, not only at first
     np.testing.assert_allclose(moved.poses.wxyz_xyz, expected, atol=1e-7)
 
@@ -150,16 +171,16 @@ def test_what_an_error_of_the_calibration_does_to_the_poses():
     """Against what it does: the optimum where all image points are moved by it."""
     problem, poses, _ = made()
     start = begun(problem, poses)
-    response = jax.jit(batch.known)(problem, PLAIN, poses, start).calibration
+    response = known(problem, PLAIN, poses, start).calibration
     error = np.array([1e-3, -2e-3, 1e-3])  # focal length, as a share; principal point, in focal lengths
 
     def moved(sign):
         focal, *centre = sign * error
         centre = np.array(centre)[:, None, None]
         layers = [x._replace(observed=(x.observed - centre) / (1 + focal)) for x in problem.layers]
-        return optimum(problem._replace(layers=tuple(layers)), PLAIN, poses, start, tolerance=1e-9, most=60).poses
+        return optimum(problem._replace(layers=tuple(layers)), PLAIN, poses, start, tolerance=1e-9).poses
 
-    found = jax.vmap(lambda a, b: (a @ b.inverse()).log())(moved(1.0), moved(-1.0)) / 2
+    found = between(moved(1.0), moved(-1.0)) / 2
     expected = jnp.einsum("kep,p->ke", response, error)
     assert abs(expected).max() > 1e-6
     np.testing.assert_allclose(found[:SEEN], expected[:SEEN], atol=1e-3 * abs(expected).max())
@@ -172,33 +193,31 @@ def test_what_is_told_of_the_intrinsics():
     start = begun(problem, poses)
     by = np.array([2e-3, -1e-3, 1e-3, -1e-3, 2e-3])  # log of the focal length, principal point over it, k1, k2
 
-    def seen(sign):
-        other = calibration.changed(camera, jnp.asarray(sign * by))
-        np.testing.assert_allclose(calibration.difference(camera, other), sign * by, atol=1e-12)
+    @jax.jit
+    def seen(by):
+        other = calibration.changed(camera, by)
 
         def again(layer):
             pixels = camera.to_pixels(jnp.moveaxis(layer.observed, 1, -1))
             return layer._replace(observed=jnp.moveaxis(other.to_normalised(pixels), -1, 1))
 
-        return problem._replace(layers=tuple(map(again, problem.layers))), other
-
-    def best(problem):
-        return optimum(problem, PLAIN, poses, start, tolerance=1e-9, most=60)
+        return problem._replace(layers=tuple(map(again, problem.layers))), other, calibration.difference(camera, other)
 
     # What was seen is exact: the least cost is that of the change, and the pull leads back.
     exact = calibration.told(problem, PLAIN, poses, start, camera)
     information = exact.information
     told, found = [], []
     for sign in (-1.0, 1.0):
-        moved, other = seen(sign)
-        found.append(best(moved))
+        moved, other, difference = seen(jnp.asarray(sign * by))
+        np.testing.assert_allclose(difference, sign * by, atol=1e-12)
+        found.append(optimum(moved, PLAIN, poses, start, tolerance=1e-9))
         told.append(calibration.told(moved, PLAIN, found[-1].poses, found[-1].points, other))
     costs = np.array([float(f.cost) for f in found])
     np.testing.assert_allclose(costs.mean(), by @ information @ by, rtol=2e-2)
     pull = (told[0].pull - told[1].pull) / 2
     np.testing.assert_allclose(pull, information @ by, atol=2e-2 * abs(information @ by).max())
     np.testing.assert_allclose(sum(s.sum(axis=(0, 2)) for s in told[0].scores), told[0].pull)
-    moved = jax.vmap(lambda a, b: (a @ b.inverse()).log())(found[1].poses, found[0].poses) / 2
+    moved = between(found[1].poses, found[0].poses) / 2
     expected = jnp.einsum("kep,p->ke", exact.response, by)
     np.testing.assert_allclose(moved[:SEEN], expected[:SEEN], atol=2e-2 * abs(expected).max())
 
@@ -212,38 +231,35 @@ def test_where_a_pixel_is_seen_by_other_intrinsics(lens):
     pixels, p = camera.to_pixels(u), calibration.unknown(camera)
     assert p == (3 if lens is None else 5)
     step = 1e-6
+    again = jax.jit(lambda x: calibration.changed(camera, x).to_normalised(pixels))
+    slope = jax.jit(calibration.slope)(camera, u)
     for i, by in enumerate(np.eye(p) * step):
-        low, high = (calibration.changed(camera, jnp.asarray(x)).to_normalised(pixels) for x in (-by, by))
-        np.testing.assert_allclose(calibration.slope(camera, u)[..., i], (high - low) / (2 * step), atol=1e-6)
+        np.testing.assert_allclose(slope[..., i], (again(by) - again(-by)) / (2 * step), atol=1e-6)
 
 
 def test_covariances_are_those_of_the_errors():
     """NEES of the newest pose and of one in the middle over many noises, as correlated as they are taken to be."""
     problem, poses, _ = made()
     draws = 60
-    batches = [made(noise=1.0, seed=k)[0] for k in range(draws)]
-    many = jax.tree.map(lambda *x: jnp.stack(x), *batches)
     start = begun(problem, poses)
 
-    @jax.jit
-    def run(problem):
-        found = batch.optimum(problem, PLAIN, poses, start, tolerance=1e-3, most=30)
-        known = batch.known(problem, PLAIN, found.poses, found.points)
-        errors = jax.vmap(lambda a, b: (b @ a.inverse()).log())(found.poses, poses)
-        return errors, known.covariance
+    def run(seed):
+        problem, *_ = made(noise=1.0, seed=seed)
+        found = optimum(problem, PLAIN, poses, start, tolerance=1e-3)
+        return between(poses, found.poses), known(problem, PLAIN, found.poses, found.points).covariance
 
-    errors, C = jax.lax.map(run, many)
+    errors, C = map(np.stack, zip(*map(run, range(draws)), strict=True))
     for pose, free in ((6, np.arange(6)), (FARTHEST, np.arange(6))):
-        e, c = np.asarray(errors[:, pose]), np.asarray(C[:, pose])
+        e, c = errors[:, pose], C[:, pose]
         # Of the farthest pose the part along the base line is given: five are free.
         nees = np.einsum("da,dab,db->d", e, np.linalg.pinv(c, rcond=1e-9, hermitian=True), e)
         low, high = nees_interval(len(free) - (pose == FARTHEST), draws)
         assert low < nees.mean() < high, (pose, nees.mean(), low, high)
 
 
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_derivatives_of_the_optimum(mode):
-    """By the implicit function theorem, against central differences of the optimum itself."""
+@pytest.fixture(scope="module")
+def implicit():
+    """A number drawn from the optimum, as far as it follows image points and noise; where it was found; differences."""
     problem, poses, _ = made(noise=1.0)
     start = begun(problem, poses)
     rng = np.random.default_rng(5)
@@ -255,17 +271,26 @@ def test_derivatives_of_the_optimum(mode):
         noise = Noise(NOISE.sigma * jnp.exp(s[1]), NOISE.scale, NOISE.correlation + s[2])
         return problem._replace(layers=(problem.layers[0], long)), noise
 
-    def value(s, found=None):
-        moved, noise = shifted(s)
-        if found is None:
-            found = batch.optimum(moved, noise, poses, start, tolerance=1e-9, most=60)
-        at, points = batch.implicit(moved, noise, found)
-        errors = jax.vmap(lambda a, b: (b @ a.inverse()).log())(poses, at)
-        return jnp.sum(weights * errors) + jnp.sum(points[0].X * 1e-3)
+    def value(s, found):
+        at, points = batch.implicit(*shifted(s), found)
+        return jnp.sum(weights * between(poses, at)) + jnp.sum(points[0].X * 1e-3)
 
-    zero = jnp.zeros(3)
-    found = jax.jit(lambda: batch.optimum(*shifted(zero), poses, start, tolerance=1e-9, most=60))()
-    slopes = (jax.jacfwd if mode == "forward" else jax.grad)(lambda s: value(s, found))
-    plain, h = jax.jit(value), 1e-3
-    central = [(plain(zero.at[i].set(h)) - plain(zero.at[i].set(-h))) / (2 * h) for i in range(3)]
-    np.testing.assert_allclose(jax.jit(slopes)(zero), central, rtol=2e-4, atol=1e-8)
+    move = jax.jit(shifted)
+    reverse = jax.jit(jax.value_and_grad(value))
+
+    def found(s):
+        return optimum(*move(s), poses, start, tolerance=1e-9)
+
+    def best(s):
+        return reverse(s, found(s))[0]
+
+    zero, h = jnp.zeros(3), 1e-3
+    central = [(best(x) - best(-x)) / (2 * h) for x in h * jnp.eye(3)]
+    return {"forward": jax.jit(jax.jacfwd(value)), "reverse": lambda *x: reverse(*x)[1]}, (zero, found(zero)), central
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivatives_of_the_optimum(implicit, mode):
+    """By the implicit function theorem, against central differences of the optimum itself."""
+    slopes, at, central = implicit
+    np.testing.assert_allclose(slopes[mode](*at), central, rtol=2e-4, atol=1e-8)
