@@ -33,9 +33,13 @@ class Plain(eqx.Module):
 
 @pytest.fixture(scope="module")
 def experiment():
-    e = paper_experiment(jax.random.key(3), n_points=POINTS, n_frames=FRAMES)
-    every = jnp.ones(POINTS, bool)
-    return e, refine(e.translations[1], SO3.from_matrix(e.rotations[1]), e.observed[0], e.observed[1], every, e.sigma)
+    @jax.jit
+    def begun():
+        e = paper_experiment(jax.random.key(3), n_points=POINTS, n_frames=FRAMES)
+        R, every = SO3.from_matrix(e.rotations[1]), jnp.ones(POINTS, bool)
+        return e, refine(e.translations[1], R, e.observed[0], e.observed[1], every, e.sigma)
+
+    return begun()
 
 
 def trifocal(e, view, log_sigma, base_noise):
@@ -88,7 +92,8 @@ gradient = jax.jit(jax.grad(run, has_aux=True), static_argnames=("case", "plain"
 @pytest.mark.parametrize("case", CASES)
 def test_the_moments_say_what_the_items_say(experiment, case):
     """After 91 frames: states to 1e-9, covariances symmetric and positive."""
-    ours, theirs = (forward(jnp.zeros(()), *experiment, case, plain) for plain in (False, True))
+    both = (forward(jnp.zeros(()), *experiment, case, plain) for plain in (False, True))
+    ours, theirs = jax.tree.map(np.asarray, tuple(both))
     (value, (beliefs, says)), (value_, (beliefs_, says_)) = ours, theirs
     for a, b in zip(jax.tree.leaves(beliefs.mean), jax.tree.leaves(beliefs_.mean), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
@@ -109,9 +114,9 @@ def test_their_derivative_is_that_of_the_items(experiment):
 
 def test_items_are_prepared_once(experiment):
     """What is prepared is taken as it is, and items of a model without a map are left alone."""
-    model, belief, pairs = trifocal(*experiment, jnp.zeros(()), base_noise=True)
+    model, belief, pairs = jax.jit(partial(trifocal, base_noise=True))(*experiment, jnp.zeros(()))
     mask = jnp.ones(POINTS, bool)
-    prepared = ekf.prepare(model, pairs, mask)
+    prepared = jax.jit(ekf.prepare)(model, pairs, mask)
     assert isinstance(prepared, projective.Moments)
     assert ekf.prepare(model, prepared, mask) is prepared
     assert ekf.prepare(Plain(model), pairs, mask) is pairs
@@ -123,18 +128,23 @@ def test_items_are_prepared_once(experiment):
 
 def test_what_items_say_of_the_state_and_what_their_points_owe(experiment):
     """Against each item's own Jacobians."""
-    model, belief, items = base_pairs(*experiment, jnp.zeros(()))
-    keys, mean = jax.random.split(jax.random.key(5)), belief.mean
-    levers = jax.random.normal(keys[0], (POINTS, 4, 6))
-    weights = jax.random.uniform(keys[1], POINTS).at[3].set(0.0)
-    prepared, none = projective.prepare(model, items), jnp.zeros((POINTS, 2))
-    said = projective.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None)
+    model, belief, items = jax.jit(base_pairs)(*experiment, jnp.zeros(()))
+    rng, mean = np.random.default_rng(5), belief.mean
+    levers, weights = rng.normal(size=(POINTS, 4, 6)), rng.uniform(size=POINTS)
+    weights[3] = 0.0
 
+    @jax.jit
+    def coupling(items, levers, weights):
+        prepared, none = projective.prepare(model, items), jnp.zeros((POINTS, 2))
+        said = projective.linearise(model, mean, jnp.zeros(12), prepared, none, weights > 0, None)
+        return jnp.moveaxis(said.coupling(weights, jnp.moveaxis(levers, 0, -1)), -1, 0)
+
+    @jax.jit
+    @jax.vmap
     def one(item, lever):
         H = jax.jacfwd(lambda e: model.measure(model.retract(mean, e), item))(jnp.zeros(12))
         J = jax.jacfwd(lambda X: model.measure(mean, item._replace(point=X)))(item.point) @ lever
         return H.T @ jnp.linalg.solve(model.noise(mean, item), J)
 
-    expected = (weights[:, None, None] * jax.vmap(one)(items, levers))[:, :6]
-    found = jnp.moveaxis(said.coupling(weights, jnp.moveaxis(levers, 0, -1)), -1, 0)
-    np.testing.assert_allclose(found, expected, atol=1e-9 * float(jnp.abs(expected).max()))
+    expected = (weights[:, None, None] * one(items, levers))[:, :6]
+    np.testing.assert_allclose(coupling(items, levers, weights), expected, atol=1e-9 * np.abs(expected).max())
