@@ -16,6 +16,9 @@ def small():
     return jax.jit(partial(paper_experiment, n_points=15, n_frames=7))(jax.random.key(2))
 
 
+filtering, smoothing = jax.jit(filtering_bound), jax.jit(smoothing_bound)
+
+
 def truth(e):
     return e.points, e.rotations, e.translations, e.sigma
 
@@ -52,14 +55,14 @@ def dense(e, frames):
 
 
 def test_filtering_bound_equals_the_inverse_of_the_whole_information(small):
-    bound = jax.jit(filtering_bound)(*truth(small))
+    bound = filtering(*truth(small))
     for k, frames in enumerate(range(3, 8)):
         expected = dense(small, frames)
         np.testing.assert_allclose(bound[k], expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
 def test_smoothing_bound_ends_where_the_filtering_bound_does(small):
-    filtered, smoothed = jax.jit(filtering_bound)(*truth(small)), jax.jit(smoothing_bound)(*truth(small))
+    filtered, smoothed = filtering(*truth(small)), smoothing(*truth(small))
     np.testing.assert_allclose(smoothed[-1], filtered[-1], rtol=1e-6, atol=1e-6 * np.abs(filtered[-1]).max())
     # Later frames only help; no error along the base line, which is the gauge.
     assert np.linalg.eigvalsh(filtered[:-1] - smoothed[1:-1]).min() > -1e-9 * np.abs(filtered).max()
@@ -68,20 +71,20 @@ def test_smoothing_bound_ends_where_the_filtering_bound_does(small):
 
 
 def test_bound_of_some_frames_points_and_noises(small):
-    every = jax.jit(filtering_bound)(*truth(small))
-    some = jax.jit(filtering_bound)(*truth(small), frames=jnp.array([3, 6]))
+    every = filtering(*truth(small))
+    some = filtering(*truth(small), frames=jnp.array([3, 6]))
     np.testing.assert_allclose(some, every[jnp.array([1, 4])], rtol=1e-9)
     points, R, T, sigma = truth(small)
-    np.testing.assert_allclose(jax.jit(filtering_bound)(points, R, T, 2 * sigma), 4 * every, rtol=1e-9)
+    np.testing.assert_allclose(filtering(points, R, T, 2 * sigma), 4 * every, rtol=1e-9)
     # A masked point is as good as none.
-    without = jax.jit(filtering_bound)(points[:-1], R, T, sigma)
+    without = filtering(points[:-1], R, T, sigma)
     mask = jnp.ones((7, 15), bool).at[:, -1].set(False)
-    np.testing.assert_allclose(jax.jit(filtering_bound)(*truth(small), mask), without, rtol=1e-6)
+    np.testing.assert_allclose(filtering(*truth(small), mask), without, rtol=1e-6)
 
 
 def test_bundle_adjustment_of_noisy_data_reaches_the_smoothing_bound(small):
     e = small
-    bound = np.asarray(jax.jit(smoothing_bound)(*truth(e)))
+    bound = np.asarray(smoothing(*truth(e)))
 
     def adjust(key):
         observed = e.clean + e.sigma * jax.random.normal(key, e.clean.shape)

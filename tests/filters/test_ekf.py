@@ -145,12 +145,12 @@ def sextant_frames():
 
     first = retract(model, belief.mean, np.linalg.cholesky(belief.covariance) @ rng.normal(size=6))
     draws = jnp.asarray(rng.normal(size=(frames, 6))), jnp.asarray(rng.normal(size=(frames, N, 2)))
-    states, observed = jax.lax.scan(advance, first, draws)[1]
+    states, observed = jax.jit(lambda *x: jax.lax.scan(advance, *x)[1])(first, draws)
     return landmarks, observed, jnp.asarray(rng.uniform(size=(frames, N)) > 0.2), states
 
 
 def central(f, x, h=1e-6):
-    return np.stack([(np.asarray(f(x + e)) - f(x - e)) / (2 * h) for e in h * np.eye(x.size)], -1)
+    return np.stack([(np.asarray(f(x + e)) - np.asarray(f(x - e))) / (2 * h) for e in h * np.eye(x.size)], -1)
 
 
 def block_diagonal(blocks):
@@ -166,8 +166,8 @@ def dense_update(model, belief, items, observed, passes):
     z, delta = np.asarray(observed).ravel(), np.zeros(len(P))
     for _ in range(passes):
         here = retract(model, prior, delta)
-        H = central(lambda e: measure(model, retract(model, prior, e), items).ravel(), delta)
-        innovation = z - measure(model, here, items).ravel() + H @ delta
+        H = central(lambda e: np.ravel(measure(model, retract(model, prior, e), items)), delta)
+        innovation = z - np.ravel(measure(model, here, items)) + H @ delta
         S = H @ P @ H.T + block_diagonal(np.asarray(noise(model, here, items)))
         K = P @ H.T @ np.linalg.inv(S)
         delta = K @ innovation
@@ -222,7 +222,7 @@ def test_update_equals_the_dense_iterated_filter(passes):
     model, belief = sextant()
     landmarks, observed, mask, _ = sextant_frames()
     seen = np.flatnonzero(mask[0])
-    expected = dense_update(model, belief, landmarks[seen], observed[0][seen], passes)
+    expected = dense_update(model, belief, np.asarray(landmarks)[seen], np.asarray(observed)[0][seen], passes)
     posterior, diagnostics = update(model, belief, landmarks, observed[0], mask[0], passes=passes)
     np.testing.assert_allclose(local(model, expected[0], posterior.mean), 0, atol=1e-8)
     np.testing.assert_allclose(posterior.covariance, expected[1], rtol=1e-5, atol=1e-10)
@@ -239,8 +239,9 @@ def test_a_blank_frame_with_noise_scales_has_a_gradient_of_zero():
         says = update(told, belief, landmarks, observed[0], mask, noise_scale=jnp.full(mask.shape, 2.0))
         return says[1].log_likelihood + jnp.trace(says[0].covariance)
 
-    assert jax.grad(loss)(model.sigma, jnp.asarray(mask[0])) != 0
-    assert jax.grad(loss)(model.sigma, jnp.zeros(mask[0].shape, bool)) == 0
+    slope = jax.jit(jax.grad(loss))
+    assert slope(model.sigma, jnp.asarray(mask[0])) != 0
+    assert slope(model.sigma, jnp.zeros(mask[0].shape, bool)) == 0
 
 
 @pytest.mark.parametrize("m", [1, 2])
@@ -375,7 +376,7 @@ def test_an_update_that_overflows_is_not_taken():
     landmarks, observed, mask, _ = sextant_frames()
     mask = mask[0].at[0].set(True)
     z = observed[0].at[0].set(1e200)  # its square is infinite
-    after, says = jax.jit(ekf.update)(model, belief, landmarks, z, mask)
+    after, says = update(model, belief, landmarks, z, mask)
     jax.tree.map(np.testing.assert_array_equal, after, belief)
     assert (int(says.used), float(says.log_likelihood), float(says.nis)) == (0, -np.inf, 0)
     assert not np.any(says.weights)
@@ -396,16 +397,17 @@ gradient = jax.jit(jax.vmap(jax.grad(log_likelihood, argnums=(0, 1, 2, 3)), (0, 
 def test_masked_item_is_an_absent_item_in_values_and_gradients():
     # At the origin, where the belief stands, the distance to a beacon of zeros has no derivative.
     model, belief, beacons, observed, seen = ranger()
-    junk = jnp.array([0.0, np.nan, np.inf, 1e30])
-    absent = log_likelihood(model, belief, beacons[seen], observed[:, seen], jnp.ones(6, bool))
+    junk = np.array([0.0, np.nan, np.inf, 1e30])
+    beacons, observed, seen = map(np.asarray, (beacons, observed, seen))
+    absent = log_likelihood(model, belief, beacons[seen], observed[:, seen], np.ones(6, bool))
     filled = (
-        jnp.where(seen[:, None], beacons, junk[:, None, None]),
-        jnp.where(seen[:, None], observed, junk[:, None, None, None]),
+        np.where(seen[:, None], beacons, junk[:, None, None]),
+        np.where(seen[:, None], observed, junk[:, None, None, None]),
     )
     for one in zip(*filled, strict=True):
         np.testing.assert_allclose(log_likelihood(model, belief, *one, seen), absent, rtol=1e-12)
     models = jax.tree.map(lambda x: jnp.broadcast_to(x, (4, *x.shape)), model)
-    slopes = gradient(models, belief, *filled, seen)
+    slopes = jax.tree.map(np.asarray, gradient(models, belief, *filled, seen))
     for leaf in jax.tree.leaves(slopes):
         np.testing.assert_allclose(leaf, np.broadcast_to(leaf[:1], leaf.shape), rtol=1e-12)
     assert not np.any(slopes[2][:, ~seen])
@@ -415,16 +417,17 @@ def test_masked_item_is_an_absent_item_in_values_and_gradients():
 
 def test_gradients_through_the_filter_equal_central_differences():
     _, belief, beacons, observed, seen = ranger()
-    theta = jnp.array([[0.03, 0.1], [0.05, 0.2], [0.07, 0.05], [0.1, 0.1]])
-    repeated = (jnp.broadcast_to(x, (4, *x.shape)) for x in (beacons, observed))
-    slopes = gradient(Ranger(theta[:, 0], theta[:, 1]), belief, *repeated, seen)
+    theta = np.array([[0.03, 0.1], [0.05, 0.2], [0.07, 0.05], [0.1, 0.1]])
+    repeated = (np.broadcast_to(x, (4, *x.shape)) for x in (beacons, observed))
+    models = Ranger(*map(jnp.asarray, theta.T))
+    slopes = jax.tree.map(np.asarray, gradient(models, belief, *repeated, seen))
 
     def value(theta, mean):
-        model = Ranger(*jnp.asarray(theta))
+        model = Ranger(*map(jnp.asarray, theta))
         return log_likelihood(model, ekf.Belief(jnp.asarray(mean), belief.covariance), beacons, observed, seen)
 
     for i in range(4):
-        by_model = central(lambda x: value(x, belief.mean), np.asarray(theta[i]))
+        by_model = central(lambda x: value(x, np.zeros(4)), theta[i])
         np.testing.assert_allclose(slopes[0].sigma[i], by_model[0], rtol=1e-6)
         np.testing.assert_allclose(slopes[0].acceleration[i], by_model[1], rtol=1e-6)
         by_mean = central(lambda x, i=i: value(theta[i], x), np.zeros(4))
@@ -434,6 +437,7 @@ def test_gradients_through_the_filter_equal_central_differences():
 def test_order_of_items_changes_nothing():
     model, belief = sextant()
     landmarks, observed, mask, _ = sextant_frames()
+    landmarks, observed, mask = map(np.asarray, (landmarks, observed, mask))
     order = np.random.default_rng(1).permutation(N)
     one = update(model, belief, landmarks, observed[0], mask[0], passes=9, robust=ROBUST)
     two = update(model, belief, landmarks[order], observed[0][order], mask[0][order], passes=9, robust=ROBUST)
@@ -498,6 +502,8 @@ def test_filter_is_a_loop_of_step():
     dt = jnp.array([1.0, 0.5, 1.0, 2.0])
     beliefs, diagnostics = filter_(model, belief, landmarks, observed[:4], mask[:4], dt, passes=4)
     predict = jax.jit(ekf.predict)
+    observed, mask = np.asarray(observed), np.asarray(mask)
+    beliefs, diagnostics = jax.tree.map(np.asarray, (beliefs, diagnostics))
     for t in range(4):
         predicted = predict(model, belief, dt[t])
         belief, report = update(model, predicted, landmarks, observed[t], mask[t], passes=4)
@@ -518,7 +524,7 @@ def test_float32_stays_float32_and_positive_over_a_long_run():
     asymmetry = np.abs(P - P.swapaxes(1, 2)).max(axis=(1, 2))
     assert (asymmetry < 1e-6 * np.abs(P).max(axis=(1, 2))).all()
     assert (np.linalg.eigvalsh((P + P.swapaxes(1, 2)) / 2)[:, 0] > 0).all()
-    errors = jax.vmap(model.local)(beliefs.mean, single(states))
+    errors = jax.jit(jax.vmap(lambda a, b: model.local(a, b)))(beliefs.mean, single(states))
     nees = np.einsum("ti,tij,tj->t", errors, np.linalg.inv(P), errors)
     low, high = nees_interval(6, nees.size / 3)  # as in `test_smoothing_a_rotating_camera`
     assert low < nees.mean() < high
@@ -587,7 +593,7 @@ def test_a_wrapped_residual_equals_the_dense_filter(passes):
     (model, _), belief, items, observed, truth = around()
     k = 19  # just before the bearing jumps from pi to -pi: predicted on one side, seen on the other
     near = ekf.Belief(jnp.asarray([*truth[k], 0.0, -0.3]), belief.covariance)
-    assert np.abs(observed[k + 1, :, 1] - jax.vmap(model.measure, (None, 0))(near.mean, items)[:, 1]).max() > 6
+    assert np.abs(observed[k + 1, :, 1] - measure(model, near.mean, items)[:, 1]).max() > 6
     found, says = update(model, near, items, observed[k + 1], jnp.ones(3, bool), passes=passes)
     arrays = (np.asarray(a) for a in (items, observed[k + 1], model.sigma))
     x, P, log_likelihood = bearing_update(near, *arrays, passes)
@@ -624,15 +630,15 @@ def test_a_residual_may_be_robust_masked_and_differentiated():
     for junk in (jnp.nan, jnp.inf, 1e30):
         assert_trees_close(run(jnp.where(mask[..., None], observed, junk)), (beliefs, said), rtol=1e-12)
 
-    @jax.jit
     def loss(sigma, observed):
         told = eqx.tree_at(lambda m: m.sigma, model, sigma)
         said = ekf.filter(told, belief, items, observed, mask, passes=9, robust=ROBUST)[1]
         return jnp.sum(said.log_likelihood)
 
     dirty = jnp.where(mask[..., None], observed, jnp.nan)
-    by_sigma, by_observed = jax.jit(jax.grad(loss, argnums=(0, 1)))(model.sigma, dirty)
-    differences = central(lambda x: loss(jnp.asarray(x), dirty), np.asarray(model.sigma))
+    both = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
+    _, (by_sigma, by_observed) = both(model.sigma, dirty)
+    differences = central(lambda x: both(x, dirty)[0], np.asarray(model.sigma))
     np.testing.assert_allclose(by_sigma, differences, rtol=1e-4)
     assert np.isfinite(by_observed).all()
     assert not by_observed[~mask].any()
