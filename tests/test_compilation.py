@@ -7,12 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from footage import clip
 
 from jaxtri.compilation import Stable, capacity
-from jaxtri.odometry.driver import Odometry
-from jaxtri.odometry.settings import StartSettings
-from jaxtri.vision.klt import KLT, KLTSettings
 
 
 @pytest.mark.parametrize(("count", "size"), [(0, 64), (1, 64), (64, 64), (65, 128), (800, 1024)])
@@ -112,22 +108,3 @@ def test_surroundings_end_where_a_library_begins():
     source = "import jax\nfrom jax import vmap\nh = jax.vmap(abs)\ndef f(x): return vmap(h)(x)"
     function = made(source).function
     assert Stable(function) == Stable(function)
-
-
-def test_nothing_is_compiled_once_the_camera_is_followed(compiled):
-    """Features come and go, keyframes are made; the first frames that are followed have compiled it all."""
-    camera, images, _ = clip()
-    # A number of features that no other test has compiled for.
-    klt = KLT(KLTSettings(capacity=120))
-    odometry, frames = Odometry(camera, start=StartSettings(lag=0), capacity=120), []
-    for frame in images:
-        tracks = klt.track(frame.image)
-        before = len(compiled)
-        klt.drop(tracks.ids[odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)])
-        frames.append((odometry.starts, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
-    starts, keyframes, programs, fresh = map(np.array, zip(*frames, strict=True))
-    followed = np.flatnonzero(starts)[2:]
-    assert keyframes[-1] > 5
-    assert fresh[followed].any()
-    assert programs[: followed[0]].sum() > 0
-    assert programs[followed].sum() == 0

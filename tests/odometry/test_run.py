@@ -4,27 +4,46 @@ import time
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from footage import clip
 
 from jaxtri.errors import InputWarning
-from jaxtri.formats import read_camera
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.run import track
 from jaxtri.odometry.settings import Settings, StartSettings, Status
 from jaxtri.output.report import run_text
-from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.trajectory import evaluate
 from jaxtri.vision.klt import KLT, KLTSettings
-from jaxtri.vision.video import open_source
+
+KLT_SETTINGS = KLTSettings(capacity=128)  # the same everywhere, so that the tracker is compiled once
+
+
+def test_nothing_is_compiled_once_the_camera_is_followed(compiled):
+    """Features come and go, keyframes are made; the first frames that are followed have compiled it all."""
+    camera, images, _ = clip()
+    jax.clear_caches()  # whatever other tests have compiled
+    klt = KLT(KLT_SETTINGS)
+    odometry, frames = Odometry(camera, start=StartSettings(lag=0), capacity=klt.settings.capacity), []
+    for frame in images:
+        tracks = klt.track(frame.image)
+        before = len(compiled)
+        klt.drop(tracks.ids[odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)])
+        frames.append((odometry.starts, odometry.keyframes, len(compiled) - before, tracks.fresh.any()))
+    starts, keyframes, programs, fresh = map(np.array, zip(*frames, strict=True))
+    followed = np.flatnonzero(starts)[2:]
+    assert keyframes[-1] > 5
+    assert fresh[followed].any()
+    assert programs[: followed[0]].sum() > 0
+    assert programs[followed].sum() == 0
 
 
 @pytest.mark.as_users
 def test_twenty_frames_are_enough_for_a_trajectory_and_its_points():
     camera, frames, truth = clip()
-    run = track(frames, camera, klt=KLTSettings(capacity=128), progress=False)
+    run = track(frames, camera, klt=KLT_SETTINGS, progress=False)
     assert set(run.trajectory.status) == {Status.TRACKING}
     found = evaluate(run.trajectory, truth)
     # 0.4 px at 280 px and 1.2 m away is 1.7 mm; the path is half a metre long.
@@ -42,7 +61,7 @@ def test_what_is_ignored_of_the_picture_is_said_and_warned_of():
     for frame in barred:
         frame.image[:40], frame.image[-40:] = 0, 0
     with pytest.warns(InputWarning, match="3[0-9]% of the picture is ignored.*--no-find-overlays"):
-        run = track(barred, camera, klt=KLTSettings(capacity=128), progress=False)
+        run = track(barred, camera, klt=KLT_SETTINGS, progress=False)
     ignored = run.statistics["ignored"]
     assert isinstance(ignored, dict)
     assert [part["bottom"] for part in ignored["found"]] == [39, 239]
@@ -52,21 +71,21 @@ def test_what_is_ignored_of_the_picture_is_said_and_warned_of():
     assert track(barred, camera, klt=plain, progress=False).statistics["ignored"] == {"share": 0.0, "found": []}
 
 
-def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatch):
+def test_the_outcome_is_the_same_whichever_thread_is_slower(monkeypatch):
     """That of one frame after the other, where a frame is followed before the filter has judged the one before it."""
-    write_laboratory(tmp_path, 24, progress=False)
-    camera, klt = read_camera(tmp_path / "camera.json"), KLTSettings(capacity=100)
-    settings = eqx.tree_at(lambda s: s.outlier, Settings.of(camera), jnp.asarray(0.03))  # gives up good points, too
+    (camera, images, _), klt = clip(), KLT_SETTINGS
+    settings = eqx.tree_at(
+        lambda s: s.outlier, Settings.of(camera), jnp.asarray(0.03, float)
+    )  # gives up good points, too
     start = StartSettings(lag=4)  # the video is short
     features, odometry = KLT(klt), Odometry(camera, settings, start=start, capacity=klt.capacity)
     outliers = [np.zeros(0, np.int64)] * 2
-    with open_source(tmp_path) as source:
-        for frame in source:
-            features.drop(outliers[-2])
-            tracks = features.track(frame.image)
-            tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers[-1]))
-            give_up = odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)
-            outliers.append(tracks.ids[give_up])
+    for frame in images:
+        features.drop(outliers[-2])
+        tracks = features.track(frame.image)
+        tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers[-1]))
+        give_up = odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids)
+        outliers.append(tracks.ids[give_up])
     odometry.finish()
     assert sum(map(len, outliers)) > 10
     assert odometry.starts == 1
@@ -77,7 +96,7 @@ def test_the_outcome_is_the_same_whichever_thread_is_slower(tmp_path, monkeypatc
             time.sleep(0.02)
             return slow(self, *arguments, **more)
 
-        with monkeypatch.context() as patch, open_source(tmp_path) as source:
+        with monkeypatch.context() as patch:
             patch.setattr(owner, slow.__name__, late)
-            run = track(source, camera, settings=settings, start=start, klt=klt, progress=False)
+            run = track(images, camera, settings=settings, start=start, klt=klt, progress=False)
         np.testing.assert_array_equal(run.trajectory.T_world_camera, odometry.trajectory().T_world_camera)
