@@ -18,6 +18,11 @@ from jaxtri.odometry.settings import Settings
 FRAMES, K1 = 40, -0.15
 
 
+@jax.jit
+def seen_by(camera, other, pixels):
+    return camera.to_pixels(other.to_normalised(pixels))
+
+
 def around(noise_px, seed=0, k1=K1):
     """Tracks of an arc of 45 degrees around the scene, seen through a lens; and the camera."""
     a = np.linspace(0, np.pi / 4, FRAMES)[:, None]
@@ -25,14 +30,14 @@ def around(noise_px, seed=0, k1=K1):
     centres = np.hstack([4 * np.sin(a), 0.3 * np.sin(4 * a), 4 - 4 * np.cos(a)])
     tracks = make(centres, np.hstack([zero, -a, zero]), noise_px=0.0, seed=seed)
     camera = replace(tracks.camera, distortion=BrownConrady.from_coefficients([k1]))
-    pixels = np.array(jax.jit(lambda z: camera.to_pixels(tracks.camera.to_normalised(z)))(jnp.asarray(tracks.pixels)))
+    pixels = np.array(seen_by(camera, tracks.camera, jnp.asarray(tracks.pixels)))
     pixels += np.random.default_rng(seed).normal(scale=noise_px, size=pixels.shape)
     return tracks._replace(camera=camera, pixels=pixels)
 
 
 def followed(tracks, focal, correlation=0.9):
     guess = Camera.from_parameters(focal, focal, 320, 240, width=640, height=480)
-    settings = eqx.tree_at(lambda s: s.correlation, Settings.of(guess), jnp.asarray(correlation))
+    settings = eqx.tree_at(lambda s: s.correlation, Settings.of(guess), jnp.asarray(correlation, float))
     return follow_tracks(guess, tracks.pixels, tracks.visible, settings=settings, record=True)
 
 

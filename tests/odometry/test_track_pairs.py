@@ -78,12 +78,15 @@ def position_errors(scene, reports):
     return np.linalg.norm(centres - scene.centres[1:], axis=-1)
 
 
+@jax.jit
+@jax.vmap
+def off(pose, R, T):
+    return log_pose(relative(SE3(pose), compose(SO3.from_matrix(R), T)))
+
+
 def squares(scene, reports):
     """NEES of the poses."""
-    poses = jax.vmap(lambda R, T: compose(SO3.from_matrix(R), T))(jnp.asarray(scene.R), jnp.asarray(scene.T))
-    errors = jax.vmap(lambda a, b: log_pose(relative(a, b)))(
-        SE3(jnp.asarray(reports.pose.wxyz_xyz)), jax.tree.map(lambda x: x[1:], poses)
-    )
+    errors = off(reports.pose.wxyz_xyz, scene.R[1:], scene.T[1:])
     return np.einsum("ti,ti->t", errors, np.linalg.solve(reports.covariance, errors[..., None])[..., 0])
 
 
@@ -136,7 +139,7 @@ def test_noise_above_the_assumed_one_is_found_and_stated():
 def test_noise_below_the_assumed_one_changes_nothing():
     scene = Scene(noise_px=0.2)
     _, reports = follow(scene)
-    _, fixed = follow(scene, settings=eqx.tree_at(lambda s: s.noise_gain, SETTINGS, jnp.asarray(0.0)))
+    _, fixed = follow(scene, settings=eqx.tree_at(lambda s: s.noise_gain, SETTINGS, jnp.asarray(0.0, float)))
     np.testing.assert_array_equal(reports.noise, 1.0)
     for a, b in zip(jax.tree.leaves(reports), jax.tree.leaves(fixed), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -197,7 +200,7 @@ def test_garbage_makes_it_coast_and_then_lose_the_camera(exact):
     scene = Scene()
     scene.observed[12:] = np.random.default_rng(0).uniform(-0.5, 0.5, scene.observed[12:].shape)
     scene.fresh[:] = False
-    _, reports = follow(scene, settings=eqx.tree_at(lambda s: s.patience, SETTINGS, jnp.asarray(3.0)))
+    _, reports = follow(scene, settings=eqx.tree_at(lambda s: s.patience, SETTINGS, jnp.asarray(3.0, float)))
     expected = [Status.TRACKING] * 11 + [Status.COASTING] * 3 + [Status.LOST] * (FRAMES - 15)
     np.testing.assert_array_equal(reports.status, expected)
     assert np.isfinite(reports.pose.wxyz_xyz).all()
