@@ -12,6 +12,8 @@ from jaxtri.filters.schmidt import Measured
 
 N, D, P = 7, 4, 3
 
+update = jax.jit(schmidt.update, static_argnames="passes")
+
 
 class Linear(eqx.Module):
     """y_i = H_i x + B_i m_i + v; the items are (H, B, Q)."""
@@ -102,7 +104,7 @@ def test_equals_the_textbook_filter(problem, passes):
 def test_one_frame_equals_the_plain_filter(problem):
     """Nothing is shared yet, so considered noise is noise."""
     model, belief, (H, B, Q), observed, mask = problem
-    ours, ours_says, _ = jax.jit(schmidt.update)(model, belief, (H, B, Q), observed[0], mask[0])
+    ours, ours_says, _ = update(model, belief, (H, B, Q), observed[0], mask[0])
 
     class Plain(Linear):
         def measure(self, mean, item):
@@ -123,9 +125,9 @@ def test_absorbed_measurements_are_counted_once(problem):
     """After an absorption the error of an item is the least-squares one, with the right correlation."""
     model, belief, items, observed, mask = problem
     H, B, Q = (np.asarray(x) for x in items)
-    before, _, _ = jax.jit(schmidt.update)(model, belief, items, observed[0], mask[0])
-    after, _, said = jax.jit(schmidt.update)(model, before, items, observed[1], mask[1], absorb=mask[1])
-    plain, _, _ = jax.jit(schmidt.update)(model, before, items, observed[1], mask[1])
+    before, _, _ = update(model, belief, items, observed[0], mask[0])
+    after, _, said = update(model, before, items, observed[1], mask[1], absorb=mask[1])
+    plain, _, _ = update(model, before, items, observed[1], mask[1])
     np.testing.assert_allclose(after.mean, plain.mean, atol=1e-12)
     gain = np.asarray(said.gain)
     keep = np.eye(P) - gain @ B
@@ -164,12 +166,13 @@ def test_what_is_masked_changes_nothing(problem):
         )
         return says.log_likelihood + jnp.sum(moved.mean) + jnp.sum(moved.sensitivity**2)
 
-    value, slope = jax.jit(jax.value_and_grad(loss))(model.sigma, observed[0], *items[:2])
-    dirty_value, dirty_slope = jax.jit(jax.value_and_grad(loss))(model.sigma, dirty, *wild)
+    both = jax.jit(jax.value_and_grad(loss))
+    value, slope = both(model.sigma, observed[0], *items[:2])
+    dirty_value, dirty_slope = both(model.sigma, dirty, *wild)
     np.testing.assert_allclose(dirty_value, value, rtol=1e-12)
     np.testing.assert_allclose(dirty_slope, slope, rtol=1e-10)
     step = 1e-6
-    up, down = (loss(model.sigma + s, observed[0], *items[:2]) for s in (step, -step))
+    up, down = (both(model.sigma + s, observed[0], *items[:2])[0] for s in (step, -step))
     np.testing.assert_allclose(slope, (up - down) / (2 * step), rtol=1e-6)
 
 
@@ -186,9 +189,7 @@ def test_float32_covariances_stay_positive(problem):
 def test_an_update_that_overflows_is_not_taken(problem):
     model, belief, items, observed, mask = problem
     seen = mask[0].at[0].set(True)
-    after, says, of_items = jax.jit(schmidt.update)(
-        model, belief, items, observed[0].at[0].set(1e200), seen, absorb=seen
-    )
+    after, says, of_items = update(model, belief, items, observed[0].at[0].set(1e200), seen, absorb=seen)
     jax.tree.map(np.testing.assert_array_equal, after, belief)
     assert (int(says.used), float(says.log_likelihood)) == (0, -np.inf)
     assert not any(np.any(x) for x in jax.tree.leaves(of_items))

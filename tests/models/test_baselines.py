@@ -90,7 +90,7 @@ def test_joint_start_is_the_covariance_of_what_it_starts_from(begun):
     e, view = jax.tree.map(lambda x: x[0], begun)
     belief = jax.jit(partial(sam.two_view_start, **SD))(view, e.observed[0], e.observed[1], e.sigma)
     P = np.asarray(belief.covariance)
-    depth, by_pose, by_noise = triangulate(view, e.observed[0], e.observed[1])
+    depth, by_pose, by_noise = map(np.asarray, jax.jit(triangulate)(view, e.observed[0], e.observed[1]))
     np.testing.assert_allclose(belief.mean.parameters, depth)
     # Draws of the pose's error and of the points' noise, moved through the triangulation.
     rng = np.random.default_rng(0)
