@@ -44,6 +44,7 @@ from jaxtri.filters.scan import batch
 from jaxtri.formats.archive import load, save
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.lenses import BrownConrady, DoubleSphere, ExtendedUnified, FieldOfView, Fisheye
+from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.models.base_frames import BaseFrames, BaseFramesState
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.baselines.structure_and_motion import StructureAndMotion
@@ -170,6 +171,7 @@ __all__ = [
     "TwoView",
     "UnitsWarning",
     "VideoError",
+    "ZoomCurve",
     "align",
     "ate_rmse",
     "batch",

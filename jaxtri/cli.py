@@ -237,7 +237,7 @@ def _track(options: Track) -> None:
     from jaxtri.odometry.rounds import track_uncalibrated
     from jaxtri.odometry.run import track, warm_up
     from jaxtri.output.report import run_text
-    from jaxtri.output.results import CAMERA, FILES, spare, write_results
+    from jaxtri.output.results import CAMERA, FILES, FOCAL, spare, write_results
     from jaxtri.vision.video import open_source, spool
 
     _check(options)
@@ -250,7 +250,7 @@ def _track(options: Track) -> None:
         camera, prior = _camera(options, source, live)
         if not live:
             read = (options.source, options.camera, options.mask)
-            written = FILES if prior is None else (*FILES, CAMERA)
+            written = FILES if prior is None else (*FILES, CAMERA, FOCAL)
             spare(options.out, [Path(p) for p in read if p is not None], source.folder, written)
         how, fps = _how(options), source.fps
         refine = options.filter.refine and not live

@@ -3,7 +3,8 @@
 Unknown are the logarithm of the focal length, the principal point in focal lengths and, of a lens with Brown's
 coefficients or none, k1 and k2. Poses and points are eliminated. What is said is that of the image points, by the slope
 of where a pixel is seen at, taken where the estimate sees it and not where it was observed: so noise of the points
-pulls nowhere, to first order.
+pulls nowhere, to first order. A focal length that changes on the way is that of all plus what knots say of each
+keyframe: the slope by its logarithm is the same for every focal length.
 Source: Triggs et al. 2000, sections 6 and 8.
 """
 
@@ -77,7 +78,7 @@ def slope(camera: Camera, u: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2
 
 
 class Told(NamedTuple):
-    """What is known of p intrinsics, whatever the poses and the points.
+    """What is known of p intrinsics and knots, whatever the poses and the points.
 
     Attributes:
         information: (p, p) by the noise that is assumed.
@@ -102,9 +103,21 @@ class _Part(NamedTuple):
 
 
 @jax.jit
-def told(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], camera: Camera) -> Told:
-    """Of the intrinsics of the camera that the observations were normalised by, at a least cost for the points."""
-    p = unknown(camera)
+def told(
+    batch: Batch,
+    noise: Noise,
+    poses: SE3,
+    points: tuple[Points, ...],
+    camera: Camera,
+    knots: Float[Array, "k m"] | None = None,
+) -> Told:
+    """Of the intrinsics of the camera that the observations were normalised by, at a least cost for the points.
+
+    With `knots` what they say of the logarithm of the focal length is unknown, too: that of a keyframe is its row times
+    them more. They stand behind the intrinsics.
+    """
+    share = jnp.zeros((len(batch.present), 0), noise.sigma.dtype) if knots is None else knots
+    p = unknown(camera) + share.shape[1]
 
     def one(chunk: Chunk, points: Points) -> _Part:
         said = chunk.said(noise, poses, points)
@@ -115,6 +128,7 @@ def told(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], cam
         widest, far = AROUND * jnp.max(jnp.abs(chunk.observed)), jnp.linalg.norm(u, axis=-1, keepdims=True)
         u = jnp.where(far > widest, u * widest / jnp.where(far > widest, far, 1.0), u)
         common = jnp.moveaxis(slope(camera, u), (0, 1, 2, 3), (0, 3, 2, 1)) / noise.sigma  # (v, p, 2, n)
+        common = jnp.concatenate([common, common[:, :1] * chunk.of(share)[:, :, None, None]], axis=1)
         common = jnp.where((said.weights > 0)[:, None, None], common, 0.0)
         precision = Precision.of(said.weights, said.kept)
         heavy, left = precision @ common, precision @ said.residual

@@ -5,7 +5,7 @@ The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, a
 
 import math
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -22,6 +22,8 @@ from jaxtri.estimation.two_view import scaled
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import identity
+from jaxtri.geometry.zoom_curve import ZoomCurve
+from jaxtri.odometry.beside import beside
 from jaxtri.odometry.followers import Follower, SinglePair, TrackPairs
 from jaxtri.odometry.poses import FramePose, pose_matrix, trajectory
 from jaxtri.odometry.recorder import Recorder
@@ -65,6 +67,7 @@ class Odometry(Archived):
         base: Which two base frames a track is measured from; a `Base` or its name.
         start: When a base pair is good enough; `StartSettings.of(base)` by default.
         frame_time: Seconds of one frame, the unit of time of the filters; the first interval by default.
+        zoom: How the focal length changes on the way, where it does.
         record: Keep the tracks, for `recording` and `jaxtri.refine`.
         capacity: Most tracks that are followed at once; by default the least of 64, 128, 256, ... that holds the rows
             of the first frame. Filters are compiled once for each.
@@ -80,6 +83,7 @@ class Odometry(Archived):
     base: Base | str = Base.TRACKS
     start: StartSettings | None = None
     frame_time: float | None = None
+    zoom: ZoomCurve | None = None
     record: bool = False
     capacity: int | None = None
 
@@ -157,6 +161,10 @@ class Odometry(Archived):
         self._queue.append(frame)
         return np.isin(ids, self._take_in(index, CATCH_UP))
 
+    def camera_at(self, time_s: float) -> Camera:
+        """The camera, with the focal length that it has at a time."""
+        return self.camera if self.zoom is None else self.zoom.camera(self.camera, time_s)
+
     def finish(self) -> None:
         """Take in the frames that came while a start was worked out, which is waited for."""
         self._take_in(math.inf, math.inf)
@@ -210,10 +218,12 @@ class Odometry(Archived):
     def recording(self) -> Recording:
         """The tracks and base pairs so far, up to where the camera is lost, for `jaxtri.replay`.
 
-        Raises `InputError` where `record` is off, `InitialisationError` where there is no start yet.
+        Raises `InputError` where `record` is off or the camera zooms, `InitialisationError` where there is no start.
         """
         if not self.record:
             raise InputError("nothing was recorded: ask for it by record=True")
+        if self.zoom is not None:
+            raise InputError("the camera zooms, and a replay takes one focal length: give a part where it does not")
         self.finish()
         if not self._recorder.pairs:
             raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
@@ -252,7 +262,7 @@ class Odometry(Archived):
         held = np.full(self.capacity, -1) if self._held is None else self._held
         tracks = slotted(held, z, seen, rows, known)
         dtype = self._settings.sigma.dtype
-        u = np.asarray(normalise(self.camera, tracks.pixels.astype(dtype)))
+        u = np.asarray(normalise(self.camera_at(time), tracks.pixels.astype(dtype)))
         tracks = tracks._replace(visible=tracks.visible & np.isfinite(u).all(axis=1))
         quality = tracks.quality.astype(dtype)
         return Observations(index, float(time), u, tracks.visible, tracks.ids, quality), tracks, rows
@@ -267,7 +277,7 @@ class Odometry(Archived):
         outliers: list[np.ndarray] = []
         while True:
             if self._seeking:
-                search = self._search = self._search or self._begin_beside()
+                search = self._search = self._search or beside(self._begin, "start")
                 if newest < self._waiting[-1].index + self._start.lag:
                     break
                 self._settle(search.result())
@@ -308,20 +318,6 @@ class Odometry(Archived):
             return
         if tried != first.index or flow >= AGAIN * before:
             self._tried, self._seeking = (first.index, flow), True
-
-    def _begin_beside(self) -> Future[_Begun | Start]:
-        """`_begin` in a thread of its own."""
-        # What a `with` has set in JAX holds for the thread that says so alone.
-        x64, device = jax.enable_x64.value, jax.default_device.value
-
-        def begin() -> _Begun | Start:
-            with jax.enable_x64(x64), jax.default_device(device):
-                return self._begin()
-
-        pool = ThreadPoolExecutor(1, thread_name_prefix="start")
-        search = pool.submit(begin)
-        pool.shutdown(wait=False)
-        return search
 
     def _settle(self, begun: _Begun | Start) -> None:
         """Go on from a start that was worked out beside, or without one."""

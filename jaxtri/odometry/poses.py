@@ -31,6 +31,8 @@ class FramePose:
         measured: How many points were measured.
         parallax_deg: Median angle between the rays that the points used are known from; NaN where there is none.
         noise: Standard deviation that the points were taken to have, over the one assumed.
+        zoom: Focal length over that of the first frame, where it is found to change though the camera is taken to have
+            one; NaN elsewhere.
     """
 
     time: float
@@ -42,6 +44,7 @@ class FramePose:
     measured: int = 0
     parallax_deg: float = float("nan")
     noise: float = 1.0
+    zoom: float = float("nan")
 
     @classmethod
     def of(cls, time: float, report: Report) -> "FramePose":
@@ -71,12 +74,14 @@ class FramePose:
             "its points fit {worse:.1f} times worse than their noise explains": found.misfit,
             "only {used} of {measured} points agree": found.minority,
             "its rotation is known to {sd:.1f} degrees": found.blurred,
+            "the camera zooms, and has {zoom:.2f} times the focal length of the first frame": not math.isnan(self.zoom),
         }
         numbers = {
             "worse": math.sqrt(self.nis / (2 * self.used)) if self.used else math.nan,
             "used": self.used,
             "measured": self.measured,
             "sd": self.rotation_sd_deg,
+            "zoom": self.zoom,
         }
         return [word.format(**numbers) for word, true in words.items() if true]
 

@@ -6,6 +6,7 @@ A frame between two of them is then measured from the points as they are. A feat
 that what it errs by in such a frame lies between what it errs by in the two keyframes, and that is known.
 """
 
+import warnings
 from dataclasses import dataclass, replace
 
 import jax
@@ -16,19 +17,21 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jaxtri.compilation import capacity
-from jaxtri.errors import InputError
+from jaxtri.errors import InputError, InputWarning
 from jaxtri.estimation import batch
-from jaxtri.estimation.layers import Noise
+from jaxtri.estimation.batch import Estimate
 from jaxtri.filters import ekf
 from jaxtri.geometry.pose import adjoint, exp_pose, local, multiply, relative
+from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.motion import Twist
 from jaxtri.odometry.adjustment import FEWEST, Adjustment, stretch
 from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.intrinsics import GUESSED, Search
 from jaxtri.odometry.measuring import doubts
 from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.settings import Settings, Status
-from jaxtri.odometry.stretches import Pieces, Segment, segments
+from jaxtri.odometry.stretches import Segment, segments
 from jaxtri.odometry.structure import Points, world_points
 from jaxtri.trajectory import Trajectory
 
@@ -65,8 +68,9 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
     Where the camera was lost, each part is refined by itself. Its first pose stays, and so does its scale: the distance
     from there to the keyframe that is farthest from it. Covariances are with respect to these two, by the noise that is
     found where that is more than the one assumed. What the camera's calibration may be off by (`Settings.calibration`)
-    is in them too; it is not estimated, since it looks too much like what features that drift do. Raises `InputError`
-    where no tracks were kept, `InitialisationError` where there is no pose.
+    is in them too; it is not estimated, since it looks too much like what features that drift do. That it changes on
+    the way is another thing: where the camera is found to zoom an `InputWarning` says so, and frames are uncertain from
+    there on. Raises `InputError` where no tracks were kept, `InitialisationError` where there is no pose.
     """
     if not odometry.record:
         raise InputError("nothing was recorded: ask for it by record=True")
@@ -83,9 +87,13 @@ def refine(odometry: Odometry, *, progress: bool = False) -> Refinement:
             parts.append({"frames": [first, end - 1], "refined": False})
         else:
             poses[first:end] = found.frames(settings, poses[first:end])
+            zoom = found.zoom(odometry, first, end, progress) if odometry.zoom is None else None
+            if zoom is not None:
+                poses[first:end] = _zoomed(zoom, poses[first:end], first)
             points.append(found.points(settings, moved))
             chosen += [first + int(k) for k in keys]
-            parts.append({"frames": [first, end - 1], "refined": True} | found.statistics)
+            said = None if zoom is None else [round(float(r), 4) for r in zoom.ratio[[0, -1]]]
+            parts.append({"frames": [first, end - 1], "refined": True, "zoom": said} | found.statistics)
         poses[first:end] = [_in(pose, moved) for pose in poses[first:end]]
         new = poses[end - 1].T_camera_world
         assert last is not None
@@ -109,15 +117,34 @@ def _best(points: Points) -> Points:
     return Points(*(x[order[which]] for x in points))
 
 
+def _zoomed(zoom: ZoomCurve, poses: list[FramePose], first: int) -> list[FramePose]:
+    """Poses, from frame `first` on, by a camera that is found to zoom."""
+    times = np.array([p.time for p in poses])
+    log = zoom.log(times)
+    begun = int(np.argmax(np.abs(log) > np.interp(times, zoom.times_s, zoom.sd)))
+    most = float(np.exp(log[np.argmax(np.abs(log))]))
+    warnings.warn(
+        f"the camera zooms from frame {first + begun} on, to {most:.2f} times the focal length of frame {first}, but "
+        "is taken to have one, so that the path is wrong from there on: let it be followed, by --refine-camera beside "
+        "--camera or --fov (track_uncalibrated)",
+        InputWarning,
+        stacklevel=3,
+    )
+    found = list(poses)
+    for k in range(begun, len(poses)):
+        status = Status.UNCERTAIN if poses[k].status is Status.TRACKING else poses[k].status
+        found[k] = replace(poses[k], zoom=float(np.exp(log[k])), status=status)
+    return found
+
+
 @dataclass
 class _Adjusted:
     """A stretch whose keyframes and points have been adjusted."""
 
     segment: Segment
     keys: np.ndarray
-    pieces: Pieces
-    noise: Noise
-    depth: float
+    begun: Adjustment
+    best: Estimate
     poses: SE3
     covariance: np.ndarray  # (k, 6, 6), of as many places as `poses` has
     X: np.ndarray  # (p, 4) homogeneous points
@@ -167,7 +194,13 @@ class _Adjusted:
         owed = float(settings.calibration) ** 2 * response @ response.swapaxes(1, 2)
         poses = now.poses, covariance * inflation + owed
         looks = pieces.looks(residual, (2,)), distance / inflation
-        return cls(segment, keys, pieces, noise, begun.depth, *poses, X, spread, agreed, *looks, said)
+        return cls(segment, keys, begun, now, *poses, X, spread, agreed, *looks, said)
+
+    def zoom(self, odometry: Odometry, first: int, end: int, progress: bool) -> ZoomCurve | None:
+        """How the focal length changes over the stretch; None where it does not."""
+        stretch = (first, end), self.segment, self.keys, self.begun
+        search = Search(odometry, *stretch, odometry.camera, GUESSED, progress)
+        return search.zoom(self.best)
 
     def points(self, settings: Settings, moved: np.ndarray) -> Points:
         """The points that at least two looks agree on, in a world that has been moved."""
@@ -178,17 +211,17 @@ class _Adjusted:
         good = self.agreed & known & np.isfinite(xyz).all(axis=1)
         R, t = moved[:3, :3], moved[:3, 3]
         # A pose becomes T moved, so a point of the world its inverse of it.
-        return Points(self.pieces.ids[good], (xyz[good] - t) @ R, R.T @ covariance[good] @ R)
+        return Points(self.begun.pieces.ids[good], (xyz[good] - t) @ R, R.T @ covariance[good] @ R)
 
     def frames(self, settings: Settings, before: list[FramePose]) -> list[FramePose]:
         """The poses of all frames, `before` what they were."""
-        found, count, scale = list(before), len(self.keys), float(self.noise.scale)
+        found, count, scale = list(before), len(self.keys), float(self.begun.noise.scale)
 
         def put(at: np.ndarray, T: np.ndarray, covariance: np.ndarray, *numbers: np.ndarray) -> None:
             for k, pose, C, used, nis, measured in zip(at, T, covariance, *(x.tolist() for x in numbers), strict=True):
                 found[k] = _judged(before[k], pose, C, used, nis, measured)
 
-        key, agree = self.pieces.key, self.distance < scale
+        key, agree = self.begun.pieces.key, self.distance < scale
         distance = _over_found(self.distance, agree)
         used, measured = (np.bincount(x, minlength=count) for x in (key[agree], key))
         nis = np.bincount(key[agree], weights=distance[agree], minlength=count)
@@ -216,17 +249,19 @@ class _Adjusted:
         t0, t1, t = (self.segment.times[x] for x in (self.keys[before], self.keys[before + 1], frames))
         share = (t - t0) / (t1 - t0)
         which, kept, variance = self._kept(frames, before, share)
-        observed = self.segment.u[frames] - float(self.noise.sigma) * kept
+        observed = self.segment.u[frames] - float(self.begun.noise.sigma) * kept
         # Between two known poses: so far the path is bent by an acceleration as large as the filter takes it to be.
         bend = ((t - t0) * (t1 - t) / 2)[:, None]
-        sd = bend * np.repeat([float(settings.acceleration) * self.depth, float(settings.angular_acceleration)], 3)
+        sd = bend * np.repeat(
+            [float(settings.acceleration) * self.begun.depth, float(settings.angular_acceleration)], 3
+        )
         # Looked for where the filter saw it from the nearer keyframe: that path knows of a jump, the straight one not.
         near = before + (share >= 0.5)
         carried = self.segment.T[frames] @ np.linalg.inv(self.segment.T[self.keys[near]])
         arguments = (before, share, near, carried, sd, self.X[which], observed, which >= 0, np.sqrt(variance))
         rest = np.zeros(TOGETHER - len(frames), int)
         padded = [jnp.asarray(np.concatenate([x, x[rest]])) for x in arguments]
-        said = _measured(settings, self.depth, self.poses, jnp.asarray(self.covariance), *padded)
+        said = _measured(settings, self.begun.depth, self.poses, jnp.asarray(self.covariance), *padded)
         return [*(np.asarray(x)[: len(frames)] for x in said), which >= 0]
 
     def _kept(
@@ -236,15 +271,15 @@ class _Adjusted:
 
         An autoregression between two of its values, or beside one: a bridge. A look that is an outlier is none.
         """
-        agree = self.distance < float(self.noise.scale)
-        ids, seen, phi = self.segment.ids, self.segment.seen[frames], float(self.noise.correlation)
+        agree = self.distance < float(self.begun.noise.scale)
+        ids, seen, phi = self.segment.ids, self.segment.seen[frames], float(self.begun.noise.correlation)
         place = np.full((len(self.keys), seen.shape[1]), -1)
-        place[self.pieces.key, self.pieces.slot] = np.arange(len(self.pieces.key))
+        place[self.begun.pieces.key, self.begun.pieces.slot] = np.arange(len(self.begun.pieces.key))
 
         def at(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             look = place[index]
             there = seen & (ids[frames] == ids[self.keys[index]]) & (look >= 0) & agree[look]
-            return np.where(there, self.pieces.piece[look], -1), self.residual[look]
+            return np.where(there, self.begun.pieces.piece[look], -1), self.residual[look]
 
         (left, r0), (right, r1) = at(before), at(before + 1)
         which = np.where(left >= 0, left, right)

@@ -35,17 +35,19 @@ def track_uncalibrated(
     say `Camera.from_fov(60, width, height)`, and `prior` what its focal length may be off by, as a share of it.
     `settings` makes those of a camera whose focal length is known to such a share; the other arguments are those of
     `track`. The intrinsics are `run.odometry.camera`, and `run.calibration` says how well they are known; where the
-    motion does not determine the focal length an `InputWarning` says so.
+    motion does not determine the focal length an `InputWarning` says so. A focal length that changes on the way is
+    followed: `run.odometry.zoom`.
 
     An interrupt (Ctrl-C) ends the sequence there, for all rounds. Raises what `track` raises; `InitialisationError`
     only where no motion is found with a shorter and a longer focal length either.
     """
     make = settings or (lambda camera, share: Settings.of(camera, calibration=share))
     guess, share, found, run, number, most = camera, min(prior, TOLERATED), None, None, 0, max(rounds, 2)
+    zoom = None
     interrupted = False
     for number in range(1, most + 1):
         try:
-            run = _tracked(reopen, guess, make, share, progress, **how)
+            run = _tracked(reopen, guess, make, share, progress, zoom=zoom, **how)
         except InitialisationError as error:
             if found is not None:
                 raise
@@ -54,13 +56,13 @@ def track_uncalibrated(
         if run.statistics["interrupted"]:  # the clip ends there, for the rounds to come, too
             interrupted, how = True, how | {"max_frames": len(run.poses)}
         found = calibrate(run.odometry, guess=camera, prior=prior, progress=progress)
-        if number == most or (number > 1 and found.shift(guess) < found.focal_sd):
+        if number == most or (number > 1 and found.shift(guess, zoom) < found.focal_sd):
             break
-        guess, share = found.camera, found.focal_sd
+        guess, share, zoom = found.camera, found.focal_sd, found.zoom
     assert run is not None
     assert found is not None
     # It was tracked with the camera before the last estimate: nearly the same, or not known to more than that.
-    found = replace(found, camera=guess, focal_sd=max(found.focal_sd, found.shift(guess)))
+    found = replace(found, camera=guess, zoom=zoom, focal_sd=max(found.focal_sd, found.shift(guess, zoom)))
     if not found.determined:
         warnings.warn(
             f"the focal length is {float(guess.fx):.0f} pixels, give or take {found.focal_sd:.0%}: the motion does not "

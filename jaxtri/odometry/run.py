@@ -19,6 +19,7 @@ from jaxtri.compilation import capacity
 from jaxtri.errors import CameraError, InputError, InputWarning
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry.calibrate import Calibration
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.poses import FramePose
@@ -83,12 +84,16 @@ def track(
     klt: KLTSettings | None = None,
     progress: bool = True,
     max_frames: int | None = None,
+    zoom: ZoomCurve | None = None,
     record: bool = False,
     refine: bool = False,
 ) -> Run:
     """Recover the camera's trajectory from the frames of a source, one pass, in order.
 
     Frames are decoded by a thread of their own, and their features followed by another, while others are filtered.
+
+    `zoom` is how the focal length changes on the way, where that is known: `jaxtri.calibrate` finds it. With `refine`
+    a frame whose focal length is another one than the camera's is called uncertain.
 
     With `record` the run can be differentiated: `run.odometry.recording()` and `jaxtri.replay`. With `refine` all
     keyframes are adjusted together at the end (`jaxtri.refine`): the trajectory is no longer causal, and about .8 times
@@ -99,7 +104,8 @@ def track(
     """
     klt = klt or KLTSettings()
     kept = record or refine
-    features, odometry = KLT(klt), Odometry(camera, settings, base, start, record=kept, capacity=klt.capacity)
+    odometry = Odometry(camera, settings, base, start, zoom=zoom, record=kept, capacity=klt.capacity)
+    features = KLT(klt)
     colours: dict[int, np.ndarray] = {}
     clock = _Clock()
     declared = source.declared if isinstance(source, FrameSource) else None
@@ -262,12 +268,14 @@ def follow_tracks(
     base: Base | str = Base.TRACKS,
     settings: Settings | None = None,
     start: StartSettings | None = None,
+    zoom: ZoomCurve | None = None,
     record: bool = False,
 ) -> Odometry:
     """Recover the camera's trajectory from feature tracks: `pixels` (t, n, 2) and `visible` (t, n), a column a track.
 
-    A pixel that is NaN counts as not visible. `times` (t,) are in seconds, by default the numbers of the frames. The
-    columns are filled up to 64, 128, 256, ..., so that another number of tracks compiles nothing.
+    A pixel that is NaN counts as not visible. `times` (t,) are in seconds, by default the numbers of the frames. `zoom`
+    is how the focal length changes on the way, where that is known: `jaxtri.calibrate` finds it. The columns are filled
+    up to 64, 128, 256, ..., so that another number of tracks compiles nothing.
 
     Raises `InputError` where a shape does not fit or there are fewer than two frames.
     """
@@ -276,7 +284,7 @@ def follow_tracks(
     t = np.arange(len(z), dtype=float) if times is None else numbers("times", times, (len(z),))
     if len(z) < 2:
         raise InputError(f"pixels hold {len(z)} frames; a camera's motion needs at least two")
-    odometry = Odometry(camera, settings, base, start, record=record, capacity=capacity(z.shape[1]))
+    odometry = Odometry(camera, settings, base, start, zoom=zoom, record=record, capacity=capacity(z.shape[1]))
     for k in range(len(z)):
         odometry.add(z[k], seen[k], float(t[k]))
     odometry.finish()

@@ -1,5 +1,6 @@
 """Stretches that a camera was followed over: frames, keyframes, and tracks cut for `jaxtri.estimation.batch`."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -39,13 +40,16 @@ class Segment(NamedTuple):
     measured: np.ndarray  # (t,) frames whose pose comes from what they show
 
     @classmethod
-    def of(cls, odometry: Odometry, first: int, end: int, camera: Camera | None = None) -> "Segment":
-        """Of frames of a run, as it recorded them; as seen by another camera, where one is given."""
+    def of(
+        cls, odometry: Odometry, first: int, end: int, camera_at: Callable[[float], Camera] | None = None
+    ) -> "Segment":
+        """Of frames of a run, as it recorded them; as seen by the camera of each time (s), where another is given."""
         tracks: list[Slotted] = odometry.tracks[first:end]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
-        u = np.stack([np.asarray(normalise(camera or odometry.camera, t.pixels.astype(dtype))) for t in tracks])
-        seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
         poses = odometry.poses[first:end]
+        cameras = map(camera_at or odometry.camera_at, (p.time for p in poses))
+        u = np.stack([np.asarray(normalise(c, t.pixels.astype(dtype))) for c, t in zip(cameras, tracks, strict=True)])
+        seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
         times = np.array([p.time for p in poses]) / (odometry.frame_time or 1.0)
         return cls(

@@ -52,6 +52,9 @@ def _camera(found: Calibration) -> str:
     if found.radial_sd and found.camera.distortion is not None:
         radial = zip(("k1", "k2"), found.camera.distortion.coefficients.tolist(), found.radial_sd, strict=False)
         said += "".join(f", {name} {k:.3f} +- {sd:.2g}" for name, k, sd in radial)
+    if found.zoom is not None:
+        first, last = (fx * found.zoom.ratio[k] for k in (0, -1))
+        said = f"the camera zooms, from {first:.5g} to {last:.5g} pixels; mean {said}"
     return f"{said}: {'from the video' if found.determined else 'NOT determined by this motion'}"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxtri.errors import InputError
-from jaxtri.formats import atomic_path, write_camera, write_json, write_ply, write_tum
+from jaxtri.formats import atomic_path, atomic_write, write_camera, write_json, write_ply, write_tum
 from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.run import Run
 from jaxtri.odometry.settings import Status
@@ -33,8 +33,8 @@ FILES = (
     "recording.rrd",
 )
 """Everything that a run may write into its folder."""
-CAMERA = "camera.json"
-"""What a run writes beside that where it estimates the camera, too."""
+CAMERA, FOCAL = "camera.json", "focal_length.txt"
+"""What a run writes beside that where it estimates the camera, too; the second where the camera zooms."""
 
 
 def spare(out: Path, inputs: Iterable[Path], frames: Path | None, written: Iterable[str] = FILES) -> None:
@@ -65,8 +65,9 @@ def write_results(
 ) -> list[Path]:
     """Write trajectory.txt, trajectory.png, points.ply and run.json; returns their paths.
 
-    Where the camera was estimated, too, camera.json beside them has it, for `--camera` and other tools. Where the run
-    was refined, trajectory_causal.txt beside them has what the filter made of each frame at its time.
+    Where the camera was estimated, too, camera.json beside them has it, for `--camera` and other tools; where it zooms,
+    with its mean focal length, and focal_length.txt has that of each frame. Where the run was refined,
+    trajectory_causal.txt beside them has what the filter made of each frame at its time.
     `reference` is the truth in the frame and scale of the run, for the plot.
     """
     paths = [out / name for name in ("trajectory.txt", "trajectory.png", "points.ply", "run.json")]
@@ -94,8 +95,18 @@ def write_results(
     if run.calibration is not None:
         paths.append(out / CAMERA)
         write_camera(paths[-1], run.calibration.camera)
+        if run.calibration.zoom is not None:
+            paths.append(out / FOCAL)
+            _write_focal_lengths(paths[-1], run)
     write_json(out / "run.json", {"settings": settings, "versions": versions(), "statistics": run.statistics})
     return paths
+
+
+def _write_focal_lengths(path: Path, run: Run) -> None:
+    with atomic_write(path) as file:
+        file.write("# timestamp [s], focal length [px]\n")
+        for time_s in run.trajectory.times:
+            file.write(f"{time_s:.9f} {float(run.odometry.camera_at(float(time_s)).fx):.6f}\n")
 
 
 def precise(run: Run, share: float = 0.1) -> np.ndarray:
@@ -126,7 +137,13 @@ def write_overlay(
         raise InputError(f"only {int(good.sum())} points are known well enough to stand anything on")
     posed = [k for k, p in enumerate(run.poses) if p.T_camera_world is not None]
     middle = posed[len(posed) // 2]
-    T_world_car = place(run.points.xyz[good], run.trajectory.T_world_camera[middle], camera, pixel=at)
+    zoom = run.odometry.zoom
+
+    def at_time(time_s: float) -> Camera:
+        return camera if zoom is None else zoom.camera(camera, time_s)
+
+    seen_by = at_time(run.poses[middle].time)
+    T_world_car = place(run.points.xyz[good], run.trajectory.T_world_camera[middle], seen_by, pixel=at)
     wireframe = car()
 
     def drawn() -> Iterator[np.ndarray]:
@@ -135,7 +152,7 @@ def write_overlay(
         for frame, pose in zip(bar, run.poses, strict=False):
             image = frame.image
             if pose.T_camera_world is not None:
-                image = draw_wireframe(image, camera, pose.T_camera_world, T_world_car, wireframe)
+                image = draw_wireframe(image, at_time(pose.time), pose.T_camera_world, T_world_car, wireframe)
             text = f"frame {frame.index}  {pose.status.name.lower()}"
             yield draw_text(image, f"{text}  {pose.used} points" if pose.used else text)
 

@@ -24,13 +24,20 @@ def write_recording(run: Run, camera: Camera, path: Path) -> Path:
         recording.log("world/path", rr.LineStrips3D([positions]), static=True)
         recording.log("world/points", rr.Points3D(run.points.xyz, colors=run.colours), static=True)
         size = camera.width or 2 * int(camera.cx), camera.height or 2 * int(camera.cy)
-        enlarged = np.asarray(camera.K) * np.append(np.full(2, camera.magnification), 1)  # viewers know no lenses
-        pinhole = rr.Pinhole(image_from_camera=enlarged, resolution=size)
-        recording.log("world/camera", pinhole, static=True)
+
+        def pinhole(camera: Camera) -> object:
+            enlarged = np.asarray(camera.K) * np.append(np.full(2, camera.magnification), 1)  # viewers know no lenses
+            return rr.Pinhole(image_from_camera=enlarged, resolution=size)
+
+        zoom = run.odometry.zoom
+        if zoom is None:
+            recording.log("world/camera", pinhole(camera), static=True)
         for k, T in enumerate(run.trajectory.T_world_camera):
             recording.set_time("frame", sequence=k)
             recording.set_time("time", duration=run.trajectory.times[k] - run.trajectory.times[0])
             recording.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+            if zoom is not None:
+                recording.log("world/camera", pinhole(zoom.camera(camera, float(run.trajectory.times[k]))))
         recording.flush()
         recording.disconnect()
     return path

@@ -222,6 +222,35 @@ def test_what_is_told_of_the_intrinsics():
     np.testing.assert_allclose(moved[:SEEN], expected[:SEEN], atol=2e-2 * abs(expected).max())
 
 
+def test_what_is_told_of_a_zoom():
+    """The same of a focal length that changes on the way; and knots that change together are a change of it."""
+    problem, poses, _ = made()
+    camera = Camera.from_parameters(500.0, 500.0, 320.0, 240.0)
+    start, at = begun(problem, poses), np.linspace(0, SEEN - 1, 3)
+    knots = np.stack([np.interp(np.arange(K), at, e) for e in np.eye(3)], axis=1)
+    by = np.array([0, 0, 0, 1e-3, -2e-3, 1.5e-3])
+
+    @jax.jit
+    def seen(by):
+        def again(layer):
+            frames = layer.begin[:, None] + jnp.arange(2 * layer.size)
+            return layer._replace(observed=layer.observed * jnp.exp(-(knots @ by[3:])[frames])[:, None, :, None])
+
+        return problem._replace(layers=tuple(map(again, problem.layers)))
+
+    information = np.asarray(calibration.told(problem, PLAIN, poses, start, camera, jnp.asarray(knots)).information)
+    np.testing.assert_allclose(information[:, 3:].sum(axis=1), information[:, 0], rtol=1e-9)
+    pulls, costs = [], []
+    for sign in (-1.0, 1.0):
+        moved = seen(jnp.asarray(sign * by))
+        found = optimum(moved, PLAIN, poses, start, tolerance=1e-9)
+        pulls.append(calibration.told(moved, PLAIN, found.poses, found.points, camera, jnp.asarray(knots)).pull)
+        costs.append(float(found.cost))
+    np.testing.assert_allclose(np.mean(costs), by @ information @ by, rtol=2e-2)
+    expected = information @ by
+    np.testing.assert_allclose((pulls[0] - pulls[1]) / 2, expected, atol=2e-2 * abs(expected).max())
+
+
 @pytest.mark.parametrize("lens", [None, [-0.25, 0.05], [0.1, 0.02, 1e-3, -1e-3]])
 def test_where_a_pixel_is_seen_by_other_intrinsics(lens):
     camera = Camera.from_parameters(500.0, 480.0, 320.0, 240.0)

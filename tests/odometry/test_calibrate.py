@@ -8,12 +8,14 @@ import pytest
 from scipy.stats import chi2
 from tracks import make
 
-from jaxtri.errors import InitialisationError, InputError
+from jaxtri.errors import InitialisationError, InputError, InputWarning
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.lenses import BrownConrady
 from jaxtri.odometry.calibrate import UNMODELLED, calibrate
+from jaxtri.odometry.refine import refine
 from jaxtri.odometry.run import follow_tracks
-from jaxtri.odometry.settings import Settings
+from jaxtri.odometry.settings import Settings, Status
+from jaxtri.trajectory import Trajectory, evaluate
 
 FRAMES, K1 = 40, -0.15
 
@@ -35,10 +37,16 @@ def around(noise_px, seed=0, k1=K1):
     return tracks._replace(camera=camera, pixels=pixels)
 
 
-def followed(tracks, focal, correlation=0.9):
+def followed(tracks, focal, correlation=0.9, zoom=None):
     guess = Camera.from_parameters(focal, focal, 320, 240, width=640, height=480)
     settings = eqx.tree_at(lambda s: s.correlation, Settings.of(guess), jnp.asarray(correlation, float))
-    return follow_tracks(guess, tracks.pixels, tracks.visible, settings=settings, record=True)
+    return follow_tracks(guess, tracks.pixels, tracks.visible, settings=settings, zoom=zoom, record=True)
+
+
+def zooming(tracks, ratio):
+    """What the camera sees whose focal length is so many times its own in each frame."""
+    centre = np.array([320, 240])
+    return tracks._replace(pixels=centre + ratio[:, None, None] * (tracks.pixels - centre))
 
 
 @pytest.mark.parametrize("share", [0.8, 1.25])
@@ -52,12 +60,42 @@ def test_exact_tracks_give_the_camera_back(share):
     np.testing.assert_allclose([found.camera.cx, found.camera.cy], [320, 240], atol=1.0)
     np.testing.assert_allclose(lens.coefficients[:2], [K1, 0], atol=5e-3)
     assert found.determined
+    assert found.zoom is None
     assert found.statistics()["focal_length_px"] == round(float(found.camera.fx), 3)
     # How far a camera sees what another one does at its corner: none, and a zoom by it.
     assert found.shift(found.camera) < 1e-9
     wider = replace(found.camera, fx=found.camera.fx * 1.02, fy=found.camera.fy * 1.02)
     assert found.shift(wider) == pytest.approx(0.02, rel=0.05)
     assert found.shift(replace(wider, cx=wider.cx + 9)) == found.shift(wider)
+
+
+def test_a_zoom_on_the_way_is_found_and_followed():
+    """By half of the focal length, in the middle of the way; nothing but a guess is known of the camera."""
+    ratio = 1.5 ** np.clip((np.arange(FRAMES) - 10) / 20, 0, 1)
+    tracks = zooming(around(0.3, k1=0.0), ratio)
+    truth = Trajectory(np.arange(FRAMES, dtype=float), tracks.T_world_camera)
+    found = calibrate(followed(tracks, 450))
+    assert found.zoom is not None
+    odometry, fixed = followed(tracks, float(found.camera.fx), zoom=found.zoom), followed(tracks, 500)
+    focal = np.array([float(odometry.camera_at(float(t)).fx) for t in range(FRAMES)])
+    np.testing.assert_allclose(focal, 500 * ratio, rtol=0.04)
+    np.testing.assert_allclose(focal / focal[0], ratio, atol=3 * found.zoom.sd.max())
+    known, unknown = (evaluate(o.trajectory(), truth).ate_percent for o in (odometry, fixed))
+    assert known < 0.1 * unknown
+    zoom = found.statistics()["zoom"]
+    assert isinstance(zoom, dict)
+    np.testing.assert_allclose(zoom["focal_length_px"][-1], 750, rtol=0.04)
+    with pytest.raises(InputError, match="one focal length"):
+        odometry.recording()
+    refined = refine(odometry)  # which knows of it, and doubts nothing
+    assert {p.status for p in refined.poses} == {Status.TRACKING}
+    # A camera that should not zoom is doubted from there on, with the reason.
+    with pytest.warns(InputWarning, match=r"zooms from frame 1?\d on, to 1.[45]\d times"):
+        doubted = refine(fixed)
+    begun = next(k for k, p in enumerate(doubted.poses) if p.status is Status.UNCERTAIN)
+    assert 8 <= begun < 15
+    assert all(p.status is Status.UNCERTAIN for p in doubted.poses[begun:])
+    assert "times the focal length of the first frame" in doubted.poses[-1].doubts[-1]
 
 
 def test_its_standard_deviation_is_that_of_the_errors():

@@ -9,6 +9,7 @@ import pytest
 
 from jaxtri.errors import InitialisationError, InputWarning
 from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry import rounds
 from jaxtri.odometry.calibrate import Calibration
 from jaxtri.odometry.driver import Odometry
@@ -21,19 +22,19 @@ from jaxtri.trajectory import Trajectory
 FIRST = Camera.from_fov(60, 640, 480)
 
 
-def at(focal, sd=0.02):
-    return Calibration(
-        replace(FIRST, fx=FIRST.fx * 0 + focal, fy=FIRST.fy * 0 + focal), sd, (6.0, 6.0), (0.01, 0.01), 9
-    )
+def at(focal, sd=0.02, zoom=None):
+    camera = replace(FIRST, fx=FIRST.fx * 0 + focal, fy=FIRST.fy * 0 + focal)
+    return Calibration(camera, sd, (6.0, 6.0), (0.01, 0.01), 9, zoom)
 
 
 @pytest.fixture
 def parts(monkeypatch):
     """What each round finds, and what it was called with."""
-    parts = SimpleNamespace(found=[], cameras=[], shares=[], how=[], interrupted=[], fails=lambda focal: False)
+    parts = SimpleNamespace(found=[], cameras=[], zooms=[], shares=[], how=[], interrupted=[], fails=lambda _: False)
 
-    def track(source, camera, *, settings, record, progress, **how):
+    def track(source, camera, *, settings, record, progress, zoom=None, **how):
         assert record
+        parts.zooms.append(zoom)
         parts.cameras.append(float(camera.fx))
         parts.how.append(how)
         if parts.fails(float(camera.fx)):
@@ -76,6 +77,18 @@ def test_what_does_not_settle_is_known_no_better(parts):
         run = parts.go()
     assert run.calibration.focal_sd > 0.14
     assert not run.statistics["calibration"]["determined"]
+
+
+def test_a_zoom_is_followed_in_the_next_round_and_has_to_settle(parts):
+    curves = [ZoomCurve(np.array([0.0, 6.0]), np.array([1.0, last]), np.full(2, 0.015)) for last in (1.5, 1.7, 1.71)]
+    parts.found = [at(500.0, zoom=z) for z in curves]
+    run = parts.go()
+    assert parts.zooms == [None, *curves[:2]]
+    assert run.calibration.zoom is curves[1]
+    assert run.statistics["calibration"]["zoom"]["focal_length_px"] == [500.0, 850.0]
+    assert run.calibration.shift(run.calibration.camera, curves[0]) == pytest.approx(np.log(1.7 / 1.5))
+    # Between two of its times it is geometric, and constant outside.
+    np.testing.assert_allclose(np.exp(curves[0].log(np.array([-1.0, 3.0, 9.0]))), [1.0, 1.5**0.5, 1.5])
 
 
 def test_an_interrupt_ends_the_clip_there(parts):
