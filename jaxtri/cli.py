@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
 USUAL = 60.0  # degrees: the field of view that the search begins with where nothing is known
-FROM_FOV, FROM_FILE = 0.3, 0.05  # what a focal length that is refined may be off by beforehand, as a share of it
+FROM_FOV, FROM_EXIF, FROM_FILE = 0.3, 0.1, 0.05  # what a focal length may be off by beforehand, as a share of it
 
 Source = tyro.conf.Positional[Annotated[str, arg(metavar="SOURCE")]]
 FileOption = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")]
@@ -333,12 +333,12 @@ def _camera(options: Track, source: "FrameSource", live: bool) -> tuple["Camera"
             said += f"{source.turned_deg} degrees: calibrate with the turned pictures, or take the orientation out"
             raise CameraError(f"{error}; {said}") from error
         return camera, FROM_FILE if refine else None
-    camera = Camera.from_fov(USUAL if options.fov is None else options.fov, w, h)
+    fov, prior = options.fov, FROM_FOV if refine else None
+    if fov is None:
+        fov, prior = (USUAL, GUESSED) if source.field_of_view_deg is None else (source.field_of_view_deg, FROM_EXIF)
+    camera = Camera.from_fov(fov, w, h)
     # The field of view is that of the width; what is stored in pixels that are no squares has another fy.
-    camera = replace(camera, fy=camera.fx * source.pixel_aspect)
-    if options.fov is None:
-        return camera, GUESSED
-    return camera, FROM_FOV if refine else None
+    return replace(camera, fy=camera.fx * source.pixel_aspect), prior
 
 
 def _settings(options: Track, camera: "Camera", share: float | None = None) -> "Settings":

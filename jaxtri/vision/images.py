@@ -1,12 +1,12 @@
-"""Image files: decoded as they are stored, the orientation that they declare, and the bits that they use."""
+"""Image files: decoded as they are stored, turned as they declare, and the bits that they use."""
 
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from jaxtri.vision.exif import Exif, read_exif
 from jaxtri.vision.quiet import quiet
 
 # What brings a picture of each EXIF orientation upright: (transpose, flip rows, flip columns).
@@ -27,8 +27,8 @@ _DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras have
 _LOOKED_AT = 5  # images of a folder by which the bits in use are told
 
 
-def read_image(path: Path) -> tuple[np.ndarray, int] | str:
-    """The pixels as stored, BGR of 8 or 16 bits, and their EXIF orientation; or why they cannot be had."""
+def read_image(path: Path) -> tuple[np.ndarray, Exif] | str:
+    """The pixels as stored, BGR of 8 or 16 bits, and what their EXIF says; or why they cannot be had."""
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
@@ -44,7 +44,7 @@ def read_image(path: Path) -> tuple[np.ndarray, int] | str:
             image = cv2.imdecode(data, flags) if whole else None
             if image is None or image.dtype in (np.uint8, np.uint16):
                 break
-    return f"{path.name} is not a readable image" if image is None else (image, orientation(content))
+    return f"{path.name} is not a readable image" if image is None else (image, read_exif(content))
 
 
 def turned(image: np.ndarray, orientation: int) -> np.ndarray:
@@ -65,38 +65,3 @@ def bits_in_use(files: Sequence[Path]) -> int:
         if not isinstance(found, str) and found[0].dtype == np.uint16:
             brightest = max(brightest, int(found[0].max()))
     return next(bits for bits in _DEPTHS if brightest < 2**bits)
-
-
-def orientation(content: bytes) -> int:
-    """The EXIF orientation of a JPEG or PNG file, from 1 to 8; 1 (upright) where it has none."""
-    if content[:2] == b"\xff\xd8":
-        at = 2
-        while at + 4 <= len(content) and content[at] == 0xFF and content[at + 1] != 0xDA:
-            size = struct.unpack_from(">H", content, at + 2)[0]
-            if content[at + 1] == 0xE1 and content[at + 4 : at + 10] == b"Exif\0\0":
-                return _tag(content[at + 10 : at + 2 + size])
-            at += 2 + size
-    elif content[:4] == b"\x89PNG":
-        at = 8
-        while at + 12 <= len(content):
-            size = struct.unpack_from(">I", content, at)[0]
-            if content[at + 4 : at + 8] == b"eXIf":
-                return _tag(content[at + 8 : at + 8 + size])
-            at += 12 + size
-    return 1
-
-
-def _tag(tiff: bytes) -> int:
-    """Tag 0x112 of the first directory of a TIFF block."""
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None:
-        return 1
-    try:
-        start = struct.unpack_from(order + "I", tiff, 4)[0]
-        for k in range(struct.unpack_from(order + "H", tiff, start)[0]):
-            tag, _, _, value = struct.unpack_from(order + "HHIH", tiff, start + 2 + 12 * k)
-            if tag == 0x112:
-                return value if value in _UPRIGHT else 1
-    except struct.error:
-        pass
-    return 1

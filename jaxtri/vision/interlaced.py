@@ -35,6 +35,7 @@ class Fields:
         self.folder: Path | None = None
         self.numbers: list[int] | None = None
         self.turned_deg, self.pixel_aspect = 0, float(aspect) if aspect else 1.0
+        self.focal_35mm: float | None = None
         self.index = 0
         self._frames: Iterator[Any] = self._container.decode(video=0)
 

@@ -44,7 +44,7 @@ class Masks:
         found = read_image(file)
         if isinstance(found, str):
             raise VideoError(f"mask {file}: {found}")
-        image = turned(*found)
+        image = turned(found[0], found[1].orientation)
         (h, w), (width, height) = image.shape[:2], self._size
         if (w, h) != (width, height):
             raise VideoError(f"mask {file} is {w}x{h}, the frames are {width}x{height}: draw it over one of the frames")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from jaxtri.errors import SourceWarning, VideoError
+from jaxtri.vision.exif import Exif
 from jaxtri.vision.images import CLOCKWISE, bits_in_use, read_image, turned
 from jaxtri.vision.layouts import lay_out
 from jaxtri.vision.quiet import quiet
@@ -41,6 +42,7 @@ class Capture:
         sar = self.capture.get(cv2.CAP_PROP_SAR_NUM), self.capture.get(cv2.CAP_PROP_SAR_DEN)
         aspect = sar[0] / sar[1] if min(sar) > 0 and not self.live else 1.0
         self.pixel_aspect = 1 / aspect if self.turned_deg in (90, 270) else aspect
+        self.focal_35mm: float | None = None
         self.counted = not self.live and _is_counted(Path(str(source)))
 
     def whole(self, decoded: int) -> bool:
@@ -103,6 +105,7 @@ class Folder:
         self.fps = float(1 / np.median(np.diff(self.times))) if self.times and self.times[1:] else None
         self.orientation: int | None = None  # EXIF's, of the first image
         self.turned_deg, self.pixel_aspect = 0, 1.0
+        self.focal_35mm: float | None = None  # of the first image
         self.bits: int | None = None  # in use, of images of 16
         self.said = False  # that the orientation changes
         self.index = -1
@@ -120,11 +123,12 @@ class Folder:
         found = read_image(self.files[self.index])
         return self.index, time_s, found if isinstance(found, str) else self._as_first(*found)
 
-    def _as_first(self, image: np.ndarray, orientation: int) -> np.ndarray:
+    def _as_first(self, image: np.ndarray, exif: Exif) -> np.ndarray:
         """The picture with 8 bits, turned as the first one says."""
-        name = self.files[self.index].name
+        name, orientation = self.files[self.index].name, exif.orientation
         if self.orientation is None:
             self.orientation, self.turned_deg = orientation, CLOCKWISE[orientation]
+            self.focal_35mm = exif.focal_35mm
         elif orientation != self.orientation and not self.said:
             # A camera writes which way is up as its gravity sensor sees it; its pixels stay those of one sensor.
             self.said = True

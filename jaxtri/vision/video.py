@@ -53,6 +53,7 @@ class _Reader(Protocol):
     folder: Path | None
     turned_deg: int
     pixel_aspect: float
+    focal_35mm: float | None
     numbers: list[int] | None
 
     def read(self) -> Item | None:
@@ -83,6 +84,8 @@ class FrameSource:
         timed: Whether the source or the caller says when frames were taken; `DEFAULT_FPS` is assumed otherwise.
         turned_deg: Degrees clockwise by which the stored pixels are turned, as their metadata or EXIF orientation says.
         pixel_aspect: Width of a pixel over its height, as the metadata say; the images are not resized.
+        field_of_view_deg: From the left edge to the right one of a pinhole with the focal length that the first image's
+            EXIF says, for 35 mm film; None where none does.
         decoded: Frames handed out so far.
     """
 
@@ -108,6 +111,7 @@ class FrameSource:
             raise VideoError(f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1]))
         self.size = _size(self._first)
         self.turned_deg, self.pixel_aspect = reader.turned_deg, reader.pixel_aspect
+        self.field_of_view_deg = _field_of_view_deg(reader.focal_35mm, *self.size)
         if self.turned_deg:
             warnings.warn(
                 f"{name}: the pixels are turned by {self.turned_deg} degrees, as their orientation (EXIF or metadata) "
@@ -319,6 +323,13 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
         finally:
             writer.release()
     return count
+
+
+def _field_of_view_deg(focal_35mm: float | None, width: int, height: int) -> float | None:
+    """Of the width of a picture, by a focal length for film of 36 by 24 mm, whose diagonal it has."""
+    if focal_35mm is None:
+        return None
+    return 2 * math.degrees(math.atan(width / math.hypot(width, height) * math.hypot(36, 24) / (2 * focal_35mm)))
 
 
 def _size(frame: Frame) -> tuple[int, int]:

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxtri.cli import Track, _camera, main
+from jaxtri.cli import FROM_EXIF, Track, _camera, main
 from jaxtri.errors import SourceWarning
+from jaxtri.vision.exif import read_exif
 from jaxtri.vision.images import CLOCKWISE
 from jaxtri.vision.video import open_source, write_video
 
@@ -19,9 +20,12 @@ RNG = np.random.default_rng(0)
 SCENE = cv2.resize(RNG.integers(0, 200, (6, 8, 3), np.uint8), (64, 48))
 
 
-def with_exif(jpeg, orientation, order="<"):
+def with_exif(jpeg, orientation, order="<", focal_35mm=None):
     mark = {"<": b"II", ">": b"MM"}[order]
     tiff = struct.pack(order + "2sHIHHHIHHI", mark, 42, 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+    if focal_35mm is not None:  # in a directory of its own, which the first one leads to
+        first = struct.pack(order + "HHHIHHHHIII", 2, 0x0112, 3, 1, orientation, 0, 0x8769, 4, 1, 38, 0)
+        tiff = tiff[:8] + first + struct.pack(order + "HHHIHHI", 1, 0xA405, 3, 1, focal_35mm, 0, 0)
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", 8 + len(tiff)) + b"Exif\0\0" + tiff + jpeg[2:]
 
 
@@ -41,6 +45,23 @@ def test_pictures_are_turned_as_a_viewer_turns_them(tmp_path, orientation, order
         source = open_source(tmp_path / "f")
     assert source.turned_deg == CLOCKWISE[orientation]
     np.testing.assert_array_equal(next(source).image, cv2.imread(str(tmp_path / "f" / "0.jpg")))
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_the_search_begins_with_the_focal_length_of_the_exif(tmp_path, order):
+    jpeg = cv2.imencode(".jpg", SCENE)[1].tobytes()
+    (tmp_path / "0.jpg").write_bytes(with_exif(jpeg, 1, order, 28))
+    with open_source(tmp_path) as source:
+        camera, prior = _camera(Track(str(tmp_path)), source, False)
+    # On 36 x 24 mm of film, by the diagonal.
+    np.testing.assert_allclose(camera.fx, 28 * np.hypot(64, 48) / np.hypot(36, 24))
+    assert source.field_of_view_deg == pytest.approx(2 * np.degrees(np.arctan(32 / float(camera.fx))))
+    assert prior == FROM_EXIF
+    pillow = pytest.importorskip("PIL.Image")  # the twin
+    with pillow.open(tmp_path / "0.jpg") as image:
+        assert image.getexif().get_ifd(0x8769)[0xA405] == 28
+    for end in range(12, len(with_exif(b"", 1, order, 28))):  # cut short anywhere
+        assert read_exif(with_exif(b"\xff\xd8", 1, order, 28)[:end]).orientation == 1
 
 
 def test_an_orientation_that_changes_midway_is_said_and_turns_nothing(tmp_path):
