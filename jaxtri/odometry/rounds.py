@@ -38,19 +38,20 @@ def track_uncalibrated(
     motion does not determine the focal length an `InputWarning` says so. A focal length that changes on the way is
     followed: `run.odometry.zoom`.
 
-    An interrupt (Ctrl-C) ends the sequence there, for all rounds. Raises what `track` raises; `InitialisationError`
-    only where no motion is found with a shorter and a longer focal length either.
+    An interrupt (Ctrl-C) ends the sequence there, for all rounds. Where a camera that was found shows no motion any
+    more, the round before stands, and its focal length is off by as much. Raises what `track` raises;
+    `InitialisationError` only where no motion is found with a shorter and a longer focal length either.
     """
     make = settings or (lambda camera, share: Settings.of(camera, calibration=share))
     guess, share, found, run, number, most = camera, min(prior, TOLERATED), None, None, 0, max(rounds, 2)
-    zoom = None
-    interrupted = False
+    interrupted, zoom = False, None
     for number in range(1, most + 1):
         try:
             run = _tracked(reopen, guess, make, share, progress, zoom=zoom, **how)
         except InitialisationError as error:
-            if found is not None:
-                raise
+            if run is not None:  # what the round before has found is worse than its camera: that stands
+                guess, zoom = run.odometry.camera, run.odometry.zoom
+                break
             run = _otherwise(error, reopen, guess, make, share, progress, **how)
             guess = run.odometry.camera
         if run.statistics["interrupted"]:  # the clip ends there, for the rounds to come, too

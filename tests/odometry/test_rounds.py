@@ -106,3 +106,13 @@ def test_other_focal_lengths_are_tried_where_there_is_no_motion(parts):
     parts.fails = lambda focal: True
     with pytest.raises(InitialisationError, match="no motion"):
         parts.go()
+
+
+def test_a_round_that_finds_no_motion_leaves_the_one_before(parts):
+    parts.found, parts.fails = [at(900.0)], lambda focal: focal == 900
+    with pytest.warns(InputWarning, match="does not determine"):
+        run = parts.go()
+    assert len(parts.cameras) == 2
+    assert float(run.calibration.camera.fx) == pytest.approx(float(FIRST.fx))
+    assert run.calibration.focal_sd > np.log(900 / float(FIRST.fx)) - 1e-6
+    assert not run.calibration.determined
