@@ -1,6 +1,7 @@
 """Rendered clips with exact truth: the laboratory of `jaxtri demo` and a bare room, filmed in several ways."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -120,9 +121,19 @@ def bare_room(seed: int) -> Scene:
     return transform(Scene(tuple(quads), (90, 95, 98)), _rotations(np.array([[TILT, 0, 0]]))[0])
 
 
-def rendered(name: str, path: Path, seed: int) -> Iterator[Frame]:
-    """The frames along a path."""
-    scene = bare_room(seed) if name in BARE else laboratory(1, seed).scene
-    images = rendered_sequence(scene, camera(), truth(path), noise_gray=path.noise_gray, seed=seed)
+def rendered(
+    name: str, path: Path, seed: int, lens: Camera | None = None, zoom: np.ndarray | None = None
+) -> Iterator[Frame]:
+    """The frames along a path; by another camera, or one whose focal length is so many times its own in each frame."""
+    scene, poses = bare_room(seed) if name in BARE else laboratory(1, seed).scene, truth(path)
+    seen_by, noise = lens or camera(), {"noise_gray": path.noise_gray, "seed": seed}
+    if zoom is None:
+        images = rendered_sequence(scene, seen_by, poses, **noise)
+    else:
+        cameras = (replace(seen_by, fx=seen_by.fx * z, fy=seen_by.fy * z) for z in zoom)
+        noises = ({**noise, "seed": seed + 1000 * k} for k in range(len(poses)))
+        images = (
+            next(rendered_sequence(scene, c, T[None], **n)) for c, T, n in zip(cameras, poses, noises, strict=True)
+        )
     for k, image in enumerate(images):
         yield Frame(k, k / FPS, image)

@@ -92,6 +92,11 @@ class Told(NamedTuple):
     response: Float[Array, "k 6 p"]
     scores: tuple[Float[Array, "c p n"], ...]
 
+    def first(self, count: int) -> "Told":
+        """Of the first intrinsics and knots alone; the others as given."""
+        cut = self.information[:count, :count], self.pull[:count], self.response[..., :count]
+        return Told(*cut, tuple(score[:, :count] for score in self.scores))
+
 
 class _Part(NamedTuple):
     """What a chunk says."""

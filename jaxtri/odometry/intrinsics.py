@@ -84,21 +84,30 @@ class Search:
 
     def run(self) -> Found:
         """All intrinsics, and a zoom where there is one."""
-        place, known = np.arange(len(self._x)), self.odometry.zoom is not None
+        place = np.arange(len(self._x))
         focal, intrinsics, knots = place < 1, place < self._p, place >= self._p
         with tqdm(unit="step", desc="calibrate", disable=None if self.progress else True, leave=False) as bar:
+
+            def without() -> Found:
+                told = self._descend(intrinsics, TOGETHER - ALONE, bar)
+                return Found(self._x[: self._p].copy(), self._sd(told, intrinsics)[: self._p], None)
+
             # The focal length first: far from it a lens is found that explains what is wrong with it, and stays. The
             # same of a zoom, before there are other intrinsics to explain it.
             self._descend(focal, ALONE, bar)
-            suspected, begun = known or self._suspected(intrinsics), (self._now, self._adjusted, self._x.copy())
-            told = self._descend(intrinsics, TOGETHER - ALONE, bar)
-            found, without = Found(self._x[: self._p].copy(), self._sd(told, intrinsics)[: self._p], None), self._now
-            if not suspected:
-                return found
-            self._now, self._adjusted, self._x = begun
+            found, cost = None, math.inf  # a zoom that is followed already need not be shown again
+            if self.odometry.zoom is None:
+                suspected, begun = self._suspected(intrinsics), (self._now, self._adjusted, self._x.copy())
+                found, cost = without(), float(self._now.cost)
+                if not suspected:
+                    return found
+                self._now, self._adjusted, self._x = begun
             self._descend(focal | knots, ALONE, bar)
-            told = self._descend(place >= 0, TOGETHER - ALONE, bar)
-            return self._zoom(told, place >= 0, math.inf if known else float(without.cost)) or found
+            found = self._zoom(self._descend(place >= 0, TOGETHER - ALONE, bar), cost) or found
+            if found is not None:
+                return found
+            self._x[0], self._x[knots], self._adjusted = self._x[0] + self._mean(), 0.0, False
+            return without()
 
     def zoom(self, poses: Estimate) -> ZoomCurve | None:
         """How the focal length changes on the way, over that in the first keyframe; None where it does not.
@@ -168,8 +177,8 @@ class Search:
         camera = calibration.changed(self.camera, jnp.asarray(self._x[: self._p]))
         problem, noise = self._seen(camera), self.begun.noise
         # Of the same pixels: what the odometry has by its mean focal length is taken by this one's.
-        mean = np.exp((self._share[: len(self.keys)] @ self._x[self._p :]).mean())
-        noise = noise._replace(sigma=noise.sigma * self.odometry.camera.focal / (camera.focal * mean))
+        mean = camera.focal * math.exp(self._mean())
+        noise = noise._replace(sigma=noise.sigma * self.odometry.camera.focal / mean)
         if not self._adjusted:
             self._now = Estimate.of(self._now.poses, self._now.points)
             for _ in range(self._steps):
@@ -177,9 +186,10 @@ class Search:
                 if bool(self._now.done):
                     break
             self._adjusted, self._steps = True, STEPS
-        share = jnp.asarray(self._share) if knots else None
-        told = calibration.told(problem, noise, self._now.poses, self._now.points, camera, share)
-        size = len(told.pull)
+        size, share = len(self._x) if knots else self._p, None
+        if knots:  # of as many always: what is compiled for them serves for fewer
+            share = jnp.asarray(np.pad(self._share, ((0, 0), (0, KNOTS - self._share.shape[1]))))
+        told = calibration.told(problem, noise, self._now.poses, self._now.points, camera, share).first(size)
         prior, x = self._prior[:size, :size], self._x[:size].copy()
         x[: self._p] -= self.about
         return problem, told, np.asarray(told.information) + prior, np.asarray(told.pull) - prior @ x
@@ -194,19 +204,21 @@ class Search:
         knots = np.arange(len(free)) >= self._p
         return gain(free | knots) - gain(free) > SUSPECTED * float(self._now.cost)
 
-    def _zoom(self, told: Told, free: np.ndarray, without: float) -> Found | None:
+    def _zoom(self, told: Told, without: float) -> Found | None:
         """What the descent has ended at, whose cost was so much without; None where it is no zoom."""
-        sd, log = self._sd(told, free), np.r_[0.0, self._x[self._p :]]
+        sd, log = self._sd(told, np.ones(len(self._x), bool)), np.r_[0.0, self._x[self._p :]]
         log_sd = np.hypot(np.r_[0.0, sd[self._p :]], UNMODELLED)
         better = float(self._now.cost) < (1 - BETTER) * without
         if not (better and np.abs(log / np.hypot(log_sd, UNMODELLED)).max() > CERTAIN):  # nor where it is NaN
             return None
-        # The camera's own focal length is the mean one, over all frames.
-        times = np.array([p.time for p in self.odometry.poses[slice(*self.frames)]])
-        mean = float(np.interp(times, self._times, log).mean())
-        change = self._x[: self._p].copy()
+        change, mean = self._x[: self._p].copy(), self._mean()
         change[0] += mean
         return Found(change, sd[: self._p], ZoomCurve(self._times, np.exp(log - mean), log_sd))
+
+    def _mean(self) -> float:
+        """Logarithm of the mean focal length, over all frames, over the first: it is the camera's own."""
+        times = np.array([p.time for p in self.odometry.poses[slice(*self.frames)]])
+        return float(np.interp(times, self._times, np.r_[0.0, self._x[self._p :]]).mean())
 
     def _seen(self, camera: Camera) -> batch.Batch:
         """All that was seen, as the camera and its zoom see it; what they have no ray for is left out."""
