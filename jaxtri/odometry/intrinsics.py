@@ -15,7 +15,7 @@ from jaxtri.estimation.calibration import Told
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry.adjustment import Adjustment
-from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.driver import Odometry, normalise
 from jaxtri.odometry.stretches import Pieces, Segment
 
 # What is known beforehand: of the focal length, as a share of it, where it is a guess of what most cameras have (24 to
@@ -24,7 +24,7 @@ GUESSED, CENTRE, LENS = 0.5, 0.02, (0.2, 0.1)
 ALONE, TOGETHER = 8, 20  # changes at most: of the focal length alone, and with those of all that is free
 STEPS, FIRST = 4, 20  # of the poses and points after each change, and before the first
 LARGEST = (0.25, 0.02, 0.02, 0.1, 0.05)  # change of each at once: so far is the slope still good
-SETTLED = 0.1  # standard deviations, below which a change is none
+SETTLED = 0.2  # standard deviations, below which a change is none
 TIMES, CELLS = 10, 3  # parts of the sequence, and of each side of the picture, that may err each in its own way
 # A focal length that changes is known at so many keyframes at most beside the first. Its logarithm walks: twice as long
 # in four seconds of 25 frames is two standard deviations. A change at once is a tenth at most.
@@ -35,7 +35,7 @@ KNOTS, WALK, LARGEST_ZOOM = 16, 0.035, 0.1
 UNMODELLED = 0.015
 # A zoom is looked for where it would take away such a share of the cost, which no other intrinsics would. It is one
 # where it takes away BETTER of what they leave, and the focal length changes by so many standard deviations. On ten
-# clips without one these shares are .009 and .022 at most, on one with a zoom of 1.6 they are .024 and .14 at least.
+# clips without one these shares are .004 and .022 at most, on one with a zoom of 1.6 they are .028 and .14 at least.
 SUSPECTED, BETTER, CERTAIN = 0.01, 0.05, 3.0
 
 
@@ -92,15 +92,15 @@ class Search:
                 told = self._descend(intrinsics, TOGETHER - ALONE, bar)
                 return Found(self._x[: self._p].copy(), self._sd(told, intrinsics)[: self._p], None)
 
-            # The focal length first: far from it a lens is found that explains what is wrong with it, and stays. The
-            # same of a zoom, before there are other intrinsics to explain it.
+            # The focal length first: far from it a lens is found that explains what is wrong with it, and stays.
             self._descend(focal, ALONE, bar)
             found, cost = None, math.inf  # a zoom that is followed already need not be shown again
             if self.odometry.zoom is None:
-                suspected, begun = self._suspected(intrinsics), (self._now, self._adjusted, self._x.copy())
+                begun = self._now, self._adjusted, self._x.copy()
                 found, cost = without(), float(self._now.cost)
-                if not suspected:
+                if not self._suspected(intrinsics):
                     return found
+                # From before the other intrinsics have explained it.
                 self._now, self._adjusted, self._x = begun
             self._descend(focal | knots, ALONE, bar)
             found = self._zoom(self._descend(place >= 0, TOGETHER - ALONE, bar), cost) or found
@@ -224,9 +224,11 @@ class Search:
         """All that was seen, as the camera and its zoom see it; what they have no ray for is left out."""
         zoom, none = np.exp(np.r_[0.0, self._x[self._p :]]), np.zeros(len(self._at))
         curve = ZoomCurve(self._times, zoom, none)
-        seen = Segment.of(self.odometry, *self.frames, lambda time_s: curve.camera(camera, time_s))
-        u = np.where((self.segment.seen & ~seen.seen)[..., None], np.nan, seen.u)
-        layers = []
+        u, dtype, layers = self.segment.u.copy(), self.segment.u.dtype, []
+        for key, frame in zip(self.keys, self.frames[0] + self.keys, strict=True):
+            seen_by = curve.camera(camera, self.odometry.poses[frame].time)
+            z = np.asarray(normalise(seen_by, self.odometry.tracks[frame].pixels.astype(dtype)))
+            u[key] = np.where(self.segment.seen[key][:, None], z, 0.0)
         pieces = Pieces.of(self.segment._replace(u=u), self.keys)
         for layer, (observed, mask, *_) in zip(self.begun.problem.layers, pieces.layers, strict=True):
             mask = mask & np.isfinite(observed).all(axis=1)

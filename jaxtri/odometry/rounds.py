@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -36,7 +37,8 @@ def track_uncalibrated(
     `settings` makes those of a camera whose focal length is known to such a share; the other arguments are those of
     `track`. The intrinsics are `run.odometry.camera`, and `run.calibration` says how well they are known; where the
     motion does not determine the focal length an `InputWarning` says so. A focal length that changes on the way is
-    followed: `run.odometry.zoom`.
+    followed: `run.odometry.zoom`. What was found last is what `refine` takes; the causal poses are by that of the
+    round before.
 
     An interrupt (Ctrl-C) ends the sequence there, for all rounds. Where a camera that was found shows no motion any
     more, the round before stands, and its focal length is off by as much. Raises what `track` raises;
@@ -49,8 +51,10 @@ def track_uncalibrated(
         try:
             run = _tracked(reopen, guess, make, share, progress, zoom=zoom, **how)
         except InitialisationError as error:
-            if run is not None:  # what the round before has found is worse than its camera: that stands
+            if run is not None and found is not None:  # it is worse than the camera of the round before: that stands
                 guess, zoom = run.odometry.camera, run.odometry.zoom
+                off = max(found.focal_sd, found.shift(guess, zoom))
+                found = replace(found, camera=guess, zoom=zoom, focal_sd=off)
                 break
             run = _otherwise(error, reopen, guess, make, share, progress, **how)
             guess = run.odometry.camera
@@ -62,19 +66,23 @@ def track_uncalibrated(
         guess, share, zoom = found.camera, found.focal_sd, found.zoom
     assert run is not None
     assert found is not None
-    # It was tracked with the camera before the last estimate: nearly the same, or not known to more than that.
-    found = replace(found, camera=guess, zoom=zoom, focal_sd=max(found.focal_sd, found.shift(guess, zoom)))
+    found = replace(found, focal_sd=max(found.focal_sd, found.shift(guess, zoom)))
+    if refine:  # all at once, with the camera that was found last
+        odometry = copy(run.odometry)
+        odometry.camera, odometry.zoom = found.camera, found.zoom
+        run = refined(replace(run, odometry=odometry), progress=progress)
+    else:  # it was tracked with the one before: nearly the same, or not known to more than that
+        found = replace(found, camera=guess, zoom=zoom)
     if not found.determined:
         warnings.warn(
-            f"the focal length is {float(guess.fx):.0f} pixels, give or take {found.focal_sd:.0%}: the motion does not "
-            "determine it; film with turns and with sideways motion before something near, or give what is known, "
-            "--camera or --fov",
+            f"the focal length is {float(found.camera.fx):.0f} pixels, give or take {found.focal_sd:.0%}: the motion "
+            "does not determine it; film with turns and with sideways motion before something near, or give what is "
+            "known, --camera or --fov",
             InputWarning,
             stacklevel=2,
         )
     said = {"interrupted": interrupted, "calibration": found.statistics() | {"rounds": number}}
-    run = replace(run, calibration=found, statistics=run.statistics | said)
-    return refined(run, progress=progress) if refine else run
+    return replace(run, calibration=found, statistics=run.statistics | said)
 
 
 def _tracked(

@@ -1,11 +1,9 @@
 """Stretches that a camera was followed over: frames, keyframes, and tracks cut for `jaxtri.estimation.batch`."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.driver import Odometry, normalise
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.slots import Slotted
@@ -40,14 +38,12 @@ class Segment(NamedTuple):
     measured: np.ndarray  # (t,) frames whose pose comes from what they show
 
     @classmethod
-    def of(
-        cls, odometry: Odometry, first: int, end: int, camera_at: Callable[[float], Camera] | None = None
-    ) -> "Segment":
-        """Of frames of a run, as it recorded them; as seen by the camera of each time (s), where another is given."""
+    def of(cls, odometry: Odometry, first: int, end: int) -> "Segment":
+        """Of frames of a run, as it recorded them."""
         tracks: list[Slotted] = odometry.tracks[first:end]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
         poses = odometry.poses[first:end]
-        cameras = map(camera_at or odometry.camera_at, (p.time for p in poses))
+        cameras = (odometry.camera_at(p.time) for p in poses)
         u = np.stack([np.asarray(normalise(c, t.pixels.astype(dtype))) for c, t in zip(cameras, tracks, strict=True)])
         seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
