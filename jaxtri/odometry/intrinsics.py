@@ -24,7 +24,7 @@ GUESSED, CENTRE, LENS = 0.5, 0.02, (0.2, 0.1)
 ALONE, TOGETHER = 8, 20  # changes at most: of the focal length alone, and with those of all that is free
 STEPS, FIRST = 4, 20  # of the poses and points after each change, and before the first
 LARGEST = (0.25, 0.02, 0.02, 0.1, 0.05)  # change of each at once: so far is the slope still good
-SETTLED = 0.2  # standard deviations, below which a change is none
+SETTLED = 0.1  # standard deviations, below which a change is none
 TIMES, CELLS = 10, 3  # parts of the sequence, and of each side of the picture, that may err each in its own way
 # A focal length that changes is known at so many keyframes at most beside the first. Its logarithm walks: twice as long
 # in four seconds of 25 frames is two standard deviations. A change at once is a tenth at most.

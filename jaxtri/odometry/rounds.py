@@ -37,8 +37,8 @@ def track_uncalibrated(
     `settings` makes those of a camera whose focal length is known to such a share; the other arguments are those of
     `track`. The intrinsics are `run.odometry.camera`, and `run.calibration` says how well they are known; where the
     motion does not determine the focal length an `InputWarning` says so. A focal length that changes on the way is
-    followed: `run.odometry.zoom`. What was found last is what `refine` takes; the causal poses are by that of the
-    round before.
+    followed: `run.odometry.zoom`. Where the last two rounds agree, `refine` takes what was found last; the causal poses
+    are by that of the round before.
 
     An interrupt (Ctrl-C) ends the sequence there, for all rounds. Where a camera that was found shows no motion any
     more, the round before stands, and its focal length is off by as much. Raises what `track` raises;
@@ -66,13 +66,15 @@ def track_uncalibrated(
         guess, share, zoom = found.camera, found.focal_sd, found.zoom
     assert run is not None
     assert found is not None
-    found = replace(found, focal_sd=max(found.focal_sd, found.shift(guess, zoom)))
-    if refine:  # all at once, with the camera that was found last
+    apart = found.shift(guess, zoom)
+    if refine and apart < found.focal_sd:  # all at once by what was found last: nearly what it was tracked with
         odometry = copy(run.odometry)
         odometry.camera, odometry.zoom = found.camera, found.zoom
-        run = refined(replace(run, odometry=odometry), progress=progress)
-    else:  # it was tracked with the one before: nearly the same, or not known to more than that
-        found = replace(found, camera=guess, zoom=zoom)
+        run = replace(run, odometry=odometry)
+    else:  # by the one that it was tracked with, which is known to no more than they are apart
+        found = replace(found, camera=guess, zoom=zoom, focal_sd=max(found.focal_sd, apart))
+    if refine:
+        run = refined(run, progress=progress)
     if not found.determined:
         warnings.warn(
             f"the focal length is {float(found.camera.fx):.0f} pixels, give or take {found.focal_sd:.0%}: the motion "
