@@ -32,3 +32,8 @@ class ZoomCurve:
         """The camera at a time."""
         ratio = float(np.exp(self.log(time_s)))
         return replace(camera, fx=camera.fx * ratio, fy=camera.fy * ratio)
+
+
+def camera_at(camera: Camera, zoom: ZoomCurve | None, time_s: float) -> Camera:
+    """The camera at a time, which may zoom."""
+    return camera if zoom is None else zoom.camera(camera, time_s)

@@ -22,7 +22,7 @@ from jaxtri.estimation.two_view import scaled
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.pose import identity
-from jaxtri.geometry.zoom_curve import ZoomCurve
+from jaxtri.geometry.zoom_curve import ZoomCurve, camera_at
 from jaxtri.odometry.beside import beside
 from jaxtri.odometry.followers import Follower, SinglePair, TrackPairs
 from jaxtri.odometry.poses import FramePose, pose_matrix, trajectory
@@ -163,7 +163,7 @@ class Odometry(Archived):
 
     def camera_at(self, time_s: float) -> Camera:
         """The camera, with the focal length that it has at a time."""
-        return self.camera if self.zoom is None else self.zoom.camera(self.camera, time_s)
+        return camera_at(self.camera, self.zoom, time_s)
 
     def finish(self) -> None:
         """Take in the frames that came while a start was worked out, which is waited for."""

@@ -198,9 +198,8 @@ class _Adjusted:
 
     def zoom(self, odometry: Odometry, first: int, end: int, progress: bool) -> ZoomCurve | None:
         """How the focal length changes over the stretch; None where it does not."""
-        stretch = (first, end), self.segment, self.keys, self.begun
-        search = Search(odometry, *stretch, odometry.camera, GUESSED, progress)
-        return search.zoom(self.best)
+        seen = (first, end), self.segment, self.keys, self.begun
+        return Search(odometry, *seen, odometry.camera, GUESSED, progress).zoom(self.best)
 
     def points(self, settings: Settings, moved: np.ndarray) -> Points:
         """The points that at least two looks agree on, in a world that has been moved."""

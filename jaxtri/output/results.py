@@ -11,6 +11,7 @@ from tqdm import tqdm
 from jaxtri.errors import InputError
 from jaxtri.formats import atomic_path, atomic_write, write_camera, write_json, write_ply, write_tum
 from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.zoom_curve import camera_at
 from jaxtri.odometry.run import Run
 from jaxtri.odometry.settings import Status
 from jaxtri.output.overlay import car, draw_text, draw_wireframe, place
@@ -138,11 +139,7 @@ def write_overlay(
     posed = [k for k, p in enumerate(run.poses) if p.T_camera_world is not None]
     middle = posed[len(posed) // 2]
     zoom = run.odometry.zoom
-
-    def at_time(time_s: float) -> Camera:
-        return camera if zoom is None else zoom.camera(camera, time_s)
-
-    seen_by = at_time(run.poses[middle].time)
+    seen_by = camera_at(camera, zoom, run.poses[middle].time)
     T_world_car = place(run.points.xyz[good], run.trajectory.T_world_camera[middle], seen_by, pixel=at)
     wireframe = car()
 
@@ -152,7 +149,8 @@ def write_overlay(
         for frame, pose in zip(bar, run.poses, strict=False):
             image = frame.image
             if pose.T_camera_world is not None:
-                image = draw_wireframe(image, at_time(pose.time), pose.T_camera_world, T_world_car, wireframe)
+                seen_by = camera_at(camera, zoom, pose.time)
+                image = draw_wireframe(image, seen_by, pose.T_camera_world, T_world_car, wireframe)
             text = f"frame {frame.index}  {pose.status.name.lower()}"
             yield draw_text(image, f"{text}  {pose.used} points" if pose.used else text)
 
