@@ -36,6 +36,8 @@ class _Input:
     """Estimate focal length and lens, from --camera or --fov on."""
     scale_camera: Switch = False
     """Scale the calibration to the frames: resized, not cropped."""
+    turn_camera: Annotated[int, arg(metavar="DEGREES")] = 0
+    """Turn the calibration clockwise, as the frames were: 90, 180, 270."""
     calibration_error: Annotated[
         float | None, arg(metavar="SHARE", help_behavior_hint="(default: .003; .05 with --fov)")
     ] = None
@@ -314,8 +316,7 @@ def _camera(options: Track, source: "FrameSource", live: bool) -> tuple["Camera"
     from jaxtri.geometry.camera import Camera
     from jaxtri.odometry.calibrate import GUESSED
 
-    w, h = source.size
-    refine = options.input.refine_camera
+    (w, h), more, refine = source.size, options.input, options.input.refine_camera
     if live and (refine or (options.camera is None and options.fov is None)):
         raise CameraError(
             "a live camera shows its frames once, so that it cannot be calibrated by them: give --camera FILE, or "
@@ -325,13 +326,12 @@ def _camera(options: Track, source: "FrameSource", live: bool) -> tuple["Camera"
         raise CameraError("--camera and --fov both say the focal length: give one of them")
     if options.camera is not None:
         try:
-            camera = read_camera(options.camera, width=w, height=h, scale=options.input.scale_camera)
+            camera = read_camera(options.camera, width=w, height=h, scale=more.scale_camera, turn_deg=more.turn_camera)
         except CameraError as error:
-            if source.turned_deg not in (90, 270):
+            if source.turned_deg not in (90, 270) or more.turn_camera:
                 raise
-            said = f"the frames are {w}x{h} because their orientation (EXIF or metadata) turns them by "
-            said += f"{source.turned_deg} degrees: calibrate with the turned pictures, or take the orientation out"
-            raise CameraError(f"{error}; {said}") from error
+            said = f"give --turn-camera {source.turned_deg} if it was calibrated before that"
+            raise CameraError(f"{error}; their orientation (EXIF or metadata) turns the images: {said}") from error
         return camera, FROM_FILE if refine else None
     fov, prior = options.fov, FROM_FOV if refine else None
     if fov is None:

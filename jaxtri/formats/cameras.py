@@ -23,7 +23,14 @@ _NEAR = 0.1  # share of a side up to which a principal point before its edge is 
 _UNLIKE = 3  # fx over fy: a field of an anamorphic video has 2.9
 
 
-def read_camera(path: PathLike, *, width: int | None = None, height: int | None = None, scale: bool = False) -> Camera:
+def read_camera(
+    path: PathLike,
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    scale: bool = False,
+    turn_deg: int = 0,
+) -> Camera:
     """Read a camera from the calibration file of most tools, known by what it holds and not by its name.
 
     camera.json (fx, fy, cx, cy and, if any, skew, width, height, model, distortion); OpenCV's YAML, XML and JSON;
@@ -32,18 +39,20 @@ def read_camera(path: PathLike, *, width: int | None = None, height: int | None 
     and instant-ngp; Basalt; RealSense; Open3D; CamOdoCal and VINS.
 
     `width` and `height` are those of the images. Where the file has another size, `scale=True` scales the camera to
-    images that were resized as a whole. Of several cameras that differ, `FILE#NAME` takes one. Coefficients that are
-    all zero are no distortion, unless the lens is a fisheye. Raises `CameraError` naming the file and the entry: for
-    what is missing or cannot be, and for what looks like an intrinsic and is not understood.
+    images that were resized as a whole; `turn_deg` (90, 180 or 270, clockwise) turns it as they were turned. Of several
+    cameras that differ, `FILE#NAME` takes one. Coefficients that are all zero are no distortion, unless the lens is a
+    fisheye. Raises `CameraError` naming the file and the entry: for what is missing or cannot be, and for what looks
+    like an intrinsic and is not understood.
     """
     file, name = _split(path)
     text = read_text(file, CameraError)
+    size = (height, width) if turn_deg % 180 == 90 else (width, height)  # of the images before they were turned
     try:
         source = parse(text)
-        found = _chosen(cameras(source, (width, height)), name, (width, height))
+        found = _chosen(cameras(source, size), name, size)
         if isinstance(source, Entries):
             check_unused(source)
-        return _of_size(found, width, height, scale)
+        return _of_size(found, *size, scale, turn_deg).turned(turn_deg)
     except CameraError as error:
         raise CameraError(f"{file}: {error}") from error
 
@@ -81,8 +90,8 @@ def _chosen(found: Cameras, name: str, size: Size) -> Intrinsics:
     return next(iter(fitting.values()))
 
 
-def _of_size(found: Intrinsics, width: int | None, height: int | None, scale: bool) -> Camera:
-    """The camera at the size of the images, after a look at its numbers at its own."""
+def _of_size(found: Intrinsics, width: int | None, height: int | None, scale: bool, turn_deg: int) -> Camera:
+    """The camera at the size of the images before their turn, after a look at its numbers at its own."""
     of_file = replace(found, width=found.width or width, height=found.height or height)
     camera = of_file.camera()
     if scale and None in (found.width, found.height):
@@ -95,6 +104,7 @@ def _of_size(found: Intrinsics, width: int | None, height: int | None, scale: bo
     if w is None or h is None or u is None or v is None or (w, h) == (u, v):
         return camera
     seen = f"it was calibrated at {w}x{h}, but the images are {u}x{v}"
+    seen += f" before they were turned by {turn_deg} degrees" if turn_deg else ""
     if same_aspect((w, h), (u, v)):
         if scale:
             return camera.scaled(u, v)
@@ -103,9 +113,13 @@ def _of_size(found: Intrinsics, width: int | None, height: int | None, scale: bo
             "read_camera(..., scale=True)"
         )
     if same_aspect((w, h), (v, u)):
+        if turn_deg % 180 == 90:
+            raise CameraError(f"{seen}: its sides are those of the images already; leave out the turn")
         raise CameraError(
-            f"{seen}: it is of the picture turned by 90 degrees, and the file does not say to which side; "
-            "calibrate with images as upright as these"
+            f"{seen}: it is of the picture turned by a quarter, and the file does not say to which side. Turn the "
+            "camera by --turn-camera 90 where the top of the picture that was calibrated is at the right of the "
+            "images, by 270 where it is at their left (turn_deg of read_camera)"
+            + ("" if (w, h) == (v, u) else "; and scale it, by --scale-camera, where they were not cropped")
         )
     raise CameraError(f"{seen}, of another aspect: they are cropped or stretched; calibrate for {u}x{v}")
 

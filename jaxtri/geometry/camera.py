@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxtri.checks import concrete, number
 from jaxtri.errors import CameraError
-from jaxtri.geometry.lenses import Lens
+from jaxtri.geometry.lenses import Lens, turned
 from jaxtri.geometry.undistortion import undistort
 
 
@@ -103,6 +103,11 @@ class Camera(eqx.Module):
         if self.width is None or self.height is None:
             raise CameraError("the size that the camera was calibrated at is not known: set its width and height")
         if not same_aspect((self.width, self.height), (width, height)):
+            if same_aspect((self.height, self.width), (width, height)):
+                raise CameraError(
+                    f"{width}x{height} is {self.width}x{self.height} turned by a quarter: turn the camera first, by "
+                    "turned(90) or turned(270)"
+                )
             raise CameraError(
                 f"{width}x{height} is no {self.width}x{self.height} resized: it is cropped or stretched; calibrate "
                 "for it"
@@ -118,6 +123,35 @@ class Camera(eqx.Module):
             width=width,
             height=height,
         )
+
+    def turned(self, degrees: int) -> "Camera":
+        """The camera of the same picture turned clockwise, by a multiple of 90 degrees.
+
+        Poses turn with it: what was at a normalised (x, y) is at (-y, x) after a quarter. Raises `CameraError` for
+        another angle, where the size of the picture is not known, and of a quarter where there is a skew: no matrix K
+        has that of the columns.
+        """
+        quarters, rest = divmod(degrees, 90)
+        if rest:
+            raise CameraError(f"a camera cannot be turned by {degrees} degrees: give 90, 180 or 270 (clockwise)")
+        skew = concrete(self.skew)
+        if quarters % 2 and skew is not None and (skew != 0).any():
+            raise CameraError(f"skew is {skew}: a camera with a skew cannot be turned by a quarter; calibrate without")
+        camera = self
+        for _ in range(quarters % 4):
+            if camera.width is None or camera.height is None:
+                raise CameraError("the size that the camera was calibrated at is not known: set its width and height")
+            camera = dataclasses.replace(
+                camera,
+                fx=camera.fy,
+                fy=camera.fx,
+                cx=camera.height - 1 - camera.cy,
+                cy=camera.cx,
+                distortion=None if camera.distortion is None else turned(camera.distortion),
+                width=camera.height,
+                height=camera.width,
+            )
+        return camera
 
     @property
     def magnification(self) -> Float[Array, ""] | float:

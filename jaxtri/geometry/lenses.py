@@ -179,6 +179,15 @@ Lens = BrownConrady | Fisheye | FieldOfView | DoubleSphere | ExtendedUnified
 """What a camera may have: `distort` of one point, `names` of its coefficients, `magnification` at the centre."""
 
 
+def turned(lens: Lens) -> Lens:
+    """The lens of a picture that was turned clockwise by a quarter, so that (x, y) is now (-y, x)."""
+    if not isinstance(lens, BrownConrady):
+        return lens  # the same in all directions
+    at = [0, 1, 3, 2, 4, 5, 6, 7, 10, 11, 8, 9][: len(lens.coefficients)]
+    sign = [1, 1, 1, -1, 1, 1, 1, 1, -1, -1, 1, 1][: len(lens.coefficients)]
+    return BrownConrady(lens.coefficients[jnp.array(at)] * jnp.array(sign, lens.coefficients.dtype))
+
+
 def _padded(values: Sequence[float], length: int, dtype: Any) -> Float[Array, " length"]:
     if len(values) > length:
         raise CameraError(f"{len(values)} distortion coefficients, but the model has {length}")

@@ -18,7 +18,7 @@ from jaxtri.checks import ArrayOrList, booleans, numbers
 from jaxtri.compilation import capacity
 from jaxtri.errors import CameraError, InputError, InputWarning
 from jaxtri.formats.archive import Archived
-from jaxtri.geometry.camera import Camera
+from jaxtri.geometry.camera import Camera, same_aspect
 from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry.calibrate import Calibration
 from jaxtri.odometry.driver import Odometry
@@ -293,11 +293,14 @@ def follow_tracks(
 
 def _same_size(camera: Camera, frame: Frame) -> None:
     h, w = frame.image.shape[:2]
-    if camera.width is not None and camera.height is not None and (camera.width, camera.height) != (w, h):
-        raise CameraError(
-            f"the camera was calibrated at {camera.width}x{camera.height}, the frames are {w}x{h}: give the "
-            "calibration of this size, or, where they were resized and not cropped, camera.scaled(width, height)"
-        )
+    if camera.width is None or camera.height is None or (camera.width, camera.height) == (w, h):
+        return
+    size, remedy = (camera.width, camera.height), "they are cropped or stretched; give the calibration of this size"
+    if same_aspect(size, (w, h)):
+        remedy = "give the calibration of this size, or, where they were resized and not cropped, camera.scaled(w, h)"
+    elif same_aspect(size, (h, w)):
+        remedy = "give camera.turned(90) where they are the calibrated picture turned clockwise, else turned(270)"
+    raise CameraError(f"the camera was calibrated at {size[0]}x{size[1]}, the frames are {w}x{h}: {remedy}")
 
 
 def _sample(colours: dict[int, np.ndarray], tracks: FrameTracks, image: np.ndarray) -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -454,11 +455,33 @@ def test_another_size_is_scaled_where_that_is_asked_for(tmp_path):
     xy = jnp.array([[-0.3, 0.2], [0.0, 0.0], [0.4, -0.3]])
     np.testing.assert_allclose(np.asarray(small.to_pixels(xy)) + 0.5, (np.asarray(large.to_pixels(xy)) + 0.5) / 2)
     assert (small.width, small.height) == (320, 240)
-    for size, message in (((480, 640), "turned by 90 degrees"), ((640, 360), "another aspect")):
+    for size, message in (((480, 640), "--turn-camera 90"), ((640, 360), "another aspect")):
         with pytest.raises(CameraError, match=message):
             formats.read_camera(path, width=size[0], height=size[1], scale=True)
     with pytest.raises(CameraError, match="cannot be scaled; add width"):
         formats.read_camera(write(path, FLAT), width=320, height=240, scale=True)
+
+
+def test_a_quarter_is_turned_where_that_is_asked_for(tmp_path):
+    path = write(tmp_path / "c.json", GOOD | {"distortion": BROWN})
+    flat = formats.read_camera(path)
+    for degrees in (90, 270):
+        for size, scale in (((480, 640), False), ((240, 320), True)):
+            found = formats.read_camera(path, width=size[0], height=size[1], scale=scale, turn_deg=degrees)
+            expected = flat.scaled(*size[::-1]).turned(degrees)
+            assert eqx.tree_equal(found, expected)
+    for size, more, message in (
+        ((480, 640), {}, r"640x480, but .* 480x640: .*--turn-camera 90 where the top .* at the right"),
+        ((240, 320), {}, "--turn-camera 90.*; and scale it, by --scale-camera"),
+        ((240, 320), {"turn_deg": 90}, "320x240 before they were turned by 90 degrees: .*--scale-camera"),
+        ((640, 480), {"turn_deg": 90}, "leave out the turn"),
+        ((360, 640), {"turn_deg": 90, "scale": True}, "another aspect"),
+        ((640, 480), {"turn_deg": 30}, "cannot be turned by 30"),
+    ):
+        with pytest.raises(CameraError, match=message):
+            formats.read_camera(path, width=size[0], height=size[1], **more)
+    # What says no size is of the images as they were before; so is a share of their size.
+    assert formats.read_camera(write(path, FLAT), width=480, height=640, turn_deg=90).height == 640
 
 
 def numbers(n, low=-0.5, high=0.5):

@@ -1,4 +1,5 @@
 import cv2
+import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -178,6 +179,36 @@ def test_a_scaled_camera_sees_the_same_picture(size):
     assert (scaled.width, scaled.height) == size
     with pytest.raises(CameraError, match="cropped or stretched"):
         cam.scaled(640, 480)
+
+
+@pytest.mark.parametrize("distortion", [None, FULL, PRISM, FISHEYE, FOV, DS, EUCM])
+def test_a_turned_camera_sees_the_turned_picture(distortion):
+    cam, xy = camera(distortion), jnp.asarray(ray_grid(30))
+    u, v = np.moveaxis(np.asarray(to_pixels(cam, xy)), -1, 0)
+    x, y = xy[..., 0], xy[..., 1]
+    for degrees, ray, pixel in (
+        (90, (-y, x), (479 - v, u)),
+        (180, (-x, -y), (751 - u, 479 - v)),
+        (270, (y, -x), (v, 751 - u)),
+    ):
+        turned = cam.turned(degrees)
+        np.testing.assert_allclose(turned.to_pixels(jnp.stack(ray, -1)), np.stack(pixel, -1), rtol=1e-12, atol=1e-9)
+        assert (turned.width, turned.height) == ((752, 480) if degrees == 180 else (480, 752))
+        assert eqx.tree_equal(turned.turned(-degrees), cam, rtol=1e-14)
+    jax.jit(lambda c: c.turned(90))(cam)
+
+
+def test_what_cannot_be_turned_is_named():
+    cam = camera(FULL, skew=3.0)
+    with pytest.raises(CameraError, match="skew is 3"):
+        cam.turned(90)
+    assert cam.turned(180).skew == 3
+    with pytest.raises(CameraError, match="cannot be turned by 45"):
+        cam.turned(45)
+    with pytest.raises(CameraError, match="set its width and height"):
+        Camera.from_parameters(500, 500, 320, 240).turned(90)
+    with pytest.raises(CameraError, match=r"turned\(90\) or turned\(270\)"):
+        cam.scaled(240, 376)
 
 
 def test_beyond_the_fold_the_answer_is_the_fold_on_the_same_side():

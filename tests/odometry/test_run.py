@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from footage import clip
 
-from jaxtri.errors import InputWarning
+from jaxtri.errors import CameraError, InputWarning
+from jaxtri.geometry.camera import Camera
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.run import track
 from jaxtri.odometry.settings import Settings, StartSettings, Status
 from jaxtri.output.report import run_text
 from jaxtri.trajectory import evaluate
 from jaxtri.vision.klt import KLT, KLTSettings
+from jaxtri.vision.video import Frame
 
 KLT_SETTINGS = KLTSettings(capacity=128)  # the same everywhere, so that the tracker is compiled once
 
@@ -53,6 +55,16 @@ def test_twenty_frames_are_enough_for_a_trajectory_and_its_points():
     assert run.colours.shape == run.points.xyz.shape
     assert run.statistics["frames"] == len(frames)
     assert run.statistics["ignored"] == {"share": 0.0, "found": []}
+
+
+@pytest.mark.parametrize(
+    ("size", "remedy"),
+    [((320, 240), r"camera\.scaled"), ((480, 640), r"camera\.turned\(90\)"), ((640, 360), "cropped or stretched")],
+)
+def test_a_camera_of_another_size_is_answered_by_what_makes_it_theirs(size, remedy):
+    frames = [Frame(0, 0.0, np.zeros((*size[::-1], 3), np.uint8))]
+    with pytest.raises(CameraError, match=remedy):
+        track(frames, Camera.from_fov(60, 640, 480), progress=False)
 
 
 def test_what_is_ignored_of_the_picture_is_said_and_warned_of():

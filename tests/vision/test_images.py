@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxtri.cli import FROM_EXIF, Track, _camera, main
+from jaxtri.cli import FROM_EXIF, Track, _camera, _Input, main
 from jaxtri.errors import SourceWarning
 from jaxtri.vision.exif import read_exif
 from jaxtri.vision.images import CLOCKWISE
@@ -138,7 +138,14 @@ def test_a_calibration_of_the_stored_pixels_is_told_of_the_orientation(tmp_path,
     (tmp_path / "c.json").write_text(json.dumps(camera))
     with pytest.raises(SystemExit):
         main(["track", str(tmp_path / "f"), "--camera", str(tmp_path / "c.json"), "--out", str(tmp_path / "o")])
-    assert "48x64 because their orientation (EXIF or metadata) turns them by 90 degrees" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "turned by a quarter" in said
+    assert "orientation (EXIF or metadata) turns the images: give --turn-camera 90 if it was calibrated before" in said
+    options = Track(str(tmp_path / "f"), camera=tmp_path / "c.json", input=_Input(turn_camera=90))
+    with pytest.warns(SourceWarning, match="turned by 90"):
+        source = open_source(tmp_path / "f")
+    turned, _ = _camera(options, source, live=False)
+    assert (turned.width, turned.height) == source.size
 
 
 def interlaced_film(path, fields):
