@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxtri.vision.quicktime import read_focal_35mm
+
 
 def reader(path: Path) -> "Fields | None":
     """A reader of the film if it is interlaced and PyAV (extra `video`) is there; None otherwise."""
@@ -35,7 +37,8 @@ class Fields:
         self.folder: Path | None = None
         self.numbers: list[int] | None = None
         self.turned_deg, self.pixel_aspect = 0, float(aspect) if aspect else 1.0
-        self.focal_35mm: float | None = None
+        with path.open("rb") as file:
+            self.focal_35mm = read_focal_35mm(file)
         self.index = 0
         self._frames: Iterator[Any] = self._container.decode(video=0)
 

@@ -11,6 +11,7 @@ from jaxtri.errors import SourceWarning, VideoError
 from jaxtri.vision.exif import Exif
 from jaxtri.vision.images import CLOCKWISE, bits_in_use, read_image, turned
 from jaxtri.vision.layouts import lay_out
+from jaxtri.vision.quicktime import BEGINS, read_focal_35mm
 from jaxtri.vision.quiet import quiet
 
 Item = tuple[int, float | None, np.ndarray | str]
@@ -42,8 +43,7 @@ class Capture:
         sar = self.capture.get(cv2.CAP_PROP_SAR_NUM), self.capture.get(cv2.CAP_PROP_SAR_DEN)
         aspect = sar[0] / sar[1] if min(sar) > 0 and not self.live else 1.0
         self.pixel_aspect = 1 / aspect if self.turned_deg in (90, 270) else aspect
-        self.focal_35mm: float | None = None
-        self.counted = not self.live and _is_counted(Path(str(source)))
+        self.counted, self.focal_35mm = (False, None) if self.live else _of_container(Path(str(source)))
 
     def whole(self, decoded: int) -> bool:
         """Whether the file was read to its end, given how many frames came out."""
@@ -87,11 +87,11 @@ def _opened(source: str | int) -> cv2.VideoCapture:
     return cv2.VideoCapture(path, cv2.CAP_FFMPEG if "%" in path else cv2.CAP_ANY)
 
 
-def _is_counted(path: Path) -> bool:
-    """Whether the container has an index, and with it the number of frames: MP4, MOV and AVI."""
+def _of_container(path: Path) -> tuple[bool, float | None]:
+    """Whether it has an index, and with it the number of frames: MP4, MOV and AVI. And the focal length, if said."""
     with path.open("rb") as file:
         head = file.read(12)
-    return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free") or head[:4] == b"RIFF"
+        return head[4:8] in BEGINS or head[:4] == b"RIFF", read_focal_35mm(file)
 
 
 class Folder:

@@ -85,7 +85,7 @@ class FrameSource:
         turned_deg: Degrees clockwise by which the stored pixels are turned, as their metadata or EXIF orientation says.
         pixel_aspect: Width of a pixel over its height, as the metadata say; the images are not resized.
         field_of_view_deg: From the left edge to the right one of a pinhole with the focal length that the first image's
-            EXIF says, for 35 mm film; None where none does.
+            EXIF or the video's metadata say, for 35 mm film; None where none do.
         decoded: Frames handed out so far.
     """
 
@@ -111,7 +111,8 @@ class FrameSource:
             raise VideoError(f"{name}: no frame can be decoded" + "".join(f"; {bad}" for bad in self._bad[:1]))
         self.size = _size(self._first)
         self.turned_deg, self.pixel_aspect = reader.turned_deg, reader.pixel_aspect
-        self.field_of_view_deg = _field_of_view_deg(reader.focal_35mm, *self.size)
+        w, h = self.size
+        self.field_of_view_deg = _field_of_view_deg(reader.focal_35mm, w * self.pixel_aspect, h)
         if self.turned_deg:
             warnings.warn(
                 f"{name}: the pixels are turned by {self.turned_deg} degrees, as their orientation (EXIF or metadata) "
@@ -325,8 +326,8 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
     return count
 
 
-def _field_of_view_deg(focal_35mm: float | None, width: int, height: int) -> float | None:
-    """Of the width of a picture, by a focal length for film of 36 by 24 mm, whose diagonal it has."""
+def _field_of_view_deg(focal_35mm: float | None, width: float, height: float) -> float | None:
+    """Of the width of a picture as it is shown, by a focal length for film of 36 by 24 mm, whose diagonal it has."""
     if focal_35mm is None:
         return None
     return 2 * math.degrees(math.atan(width / math.hypot(width, height) * math.hypot(36, 24) / (2 * focal_35mm)))

@@ -8,6 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from mp4 import change_mp4
 
 from jaxtri.cli import FROM_EXIF, Track, _camera, _Input, main
 from jaxtri.errors import SourceWarning
@@ -85,28 +86,6 @@ def test_images_of_16_bits_are_scaled_by_the_bits_in_use_once_for_all(tmp_path, 
             source = open_source(tmp_path, fps=1)
     for frame, image in zip(source, gray, strict=True):
         np.testing.assert_array_equal(frame.image, np.repeat(image[..., None], 3, axis=2))
-
-
-def change_mp4(path, clockwise=None, aspect=None):
-    """Write the rotation into the header of the track, or a box of the pixel aspect into that of the sample."""
-    data = bytearray(path.read_bytes())
-    if clockwise:
-        at, one = data.index(b"tkhd") - 4, 1 << 16
-        stop = at + struct.unpack_from(">I", data, at)[0]
-        w, h = struct.unpack_from(">II", data, stop - 8)
-        turn = {90: (0, one, 0, -one, 0, 0, h, 0), 180: (-one, 0, 0, 0, -one, 0, w, h)}[clockwise]
-        struct.pack_into(">9i", data, stop - 44, *turn, 1 << 30)
-    if aspect:
-        at, outer = 0, []
-        for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"):
-            at = data.index(kind, at)
-            outer.append(at - 4)
-        entry = outer[-1] + 16
-        stop = entry + struct.unpack_from(">I", data, entry)[0]
-        data[stop:stop] = struct.pack(">I4sII", 16, b"pasp", *aspect)
-        for a in (*outer, entry):
-            struct.pack_into(">I", data, a, struct.unpack_from(">I", data, a)[0] + 16)
-    path.write_bytes(data)
 
 
 @pytest.mark.parametrize("clockwise", [90, 180])
