@@ -37,6 +37,12 @@ PRINTED = {
     ],
     "save_load": [(r"(\S+) poses, tracking; the same as without a stop: True", 30, 30), (r"frame (\S+):", 15, 15)],
     "tune": [(r"(\S+) px told", 1, 1), (r"(\S+) px found", 0.09, 0.11)],
+    "uncalibrated": [
+        (r"focal length (\S+) pixels", 242, 258),
+        (r"one sigma (\S+); determined: True", 3.6, 5),
+        (r"k1 (\S+), one", -0.17, -0.13),
+        (r"(\S+) base lines in 40 frames", 4, 7),
+    ],
 }
 
 
