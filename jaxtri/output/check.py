@@ -18,6 +18,7 @@ FLICKER = 0.05  # `Survey.flicker` (up to .015)
 FLAT = 3.5  # `Survey.depth` (4.5 and more; noise alone makes 2.5, a tripod with a zoom 2.8)
 OFTEN = 0.05  # share of the frames from which combing and repeated frames count: one alone does no harm
 LONG = 0.2  # share of the frames from which a stretch that stands still counts
+UNSEEN = 1 / 3  # length of a dissolve before what is seen of it, over that: where the later shot has less than .2
 LISTED = 6  # ranges of frames that are named
 
 
@@ -76,6 +77,7 @@ def _facts(s: Survey) -> list[str]:
         "combed": s.combed,
         "cuts": s.cuts,
         "jumps": s.jumps,
+        "dissolves": s.dissolves,
     }
     return [
         f"{s.name}: {w}x{h} pixels{shape}{turned}",
@@ -130,6 +132,13 @@ def _film(s: Survey) -> list[Finding]:
         means = "the clip has several shots, which no single path joins"
         remedy = "give each shot by itself" + (f" (--max-frames {at} tracks the first)" if at > 1 else "")
         found.append(_finding(s.cuts, "begins another shot", "begin another shot", means, remedy))
+    if s.dissolves.any():
+        begin, end = _first_run(s.dissolves)
+        at = begin - round(UNSEEN * (end - begin))
+        means = "each is a mixture of an earlier and a later picture, and no single path joins two shots"
+        remedy = "look there; if it is so, give each shot by itself"
+        remedy += f" (--max-frames {at} tracks the first)" if at > 1 else ""
+        found.append(_finding(s.dissolves, "seems to dissolve", "seem to dissolve into another shot", means, remedy))
     if s.combed.mean() > OFTEN:
         means = "even and odd rows were taken at two moments: the film is interlaced"
         remedy = f"deinterlace {'the film of these images' if s.folder else 'it'}: ffmpeg -i FILE -vf yadif new.mp4"
@@ -199,6 +208,11 @@ def _finding(mask: Bool[np.ndarray, " t"], one: str, many: str, means: str, reme
     at = np.flatnonzero(mask)
     seen = f"frame {at[0]} {one}" if len(at) == 1 else f"frames {ranges(mask, LISTED)} {many}"
     return Finding(seen, means, remedy, tuple(int(k) for k in at))
+
+
+def _first_run(mask: Bool[np.ndarray, " t"]) -> tuple[int, int]:
+    at = np.flatnonzero(mask)
+    return int(at[0]), int(at[0]) + int(np.argmin(np.append(mask[at[0] :], False)))
 
 
 def _exposed(s: Survey) -> str:

@@ -13,6 +13,12 @@ ENDS = 2  # grey levels from either end that count as clipped: coding moves them
 SMOOTH, REBLUR = 0.8, 9  # pixels: against noise; and the blur that a blurred picture hardly notices
 STRONG = 0.95  # share of the pixels that have weaker edges than those by which blur is told
 STANDS_OUT = 8  # grey levels by which a row must differ from both beside it
+COARSE, FINE, PARTS, SPREAD = (
+    160,
+    (1.0, 4.0),
+    (8, 6),
+    8.0,
+)  # pixels across, band, parts, blur between parts: of contrast
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,7 @@ class Look:
         combing: Share of the pixels that differ from both rows beside them, less three times the columns' share.
         grey: The picture in grey, at most `WIDE` pixels across.
         colours: Histogram of the thumbnail, its mean brought to the middle of the scale; sums to 1.
+        contrast: Mean square of the fine structure in each part, over that of the brightness; never zero.
     """
 
     brightness: float
@@ -36,11 +43,15 @@ class Look:
     combing: float
     grey: UInt8[np.ndarray, "h w"]
     colours: Float[np.ndarray, " bins"]
+    contrast: Float[np.ndarray, " parts"]
 
     def against(self, before: "Look") -> tuple[float, float]:
         """Mean absolute difference in grey levels, and the share whose colours are others."""
-        difference = cv2.absdiff(self.grey, before.grey).mean()
-        return float(difference), float(1 - np.minimum(self.colours, before.colours).sum())
+        return float(cv2.absdiff(self.grey, before.grey).mean()), self.recoloured(before)
+
+    def recoloured(self, before: "Look") -> float:
+        """The share whose colours are others."""
+        return float(1 - np.minimum(self.colours, before.colours).sum())
 
 
 def look(image: UInt8[np.ndarray, "h w 3"]) -> Look:
@@ -58,6 +69,7 @@ def look(image: UInt8[np.ndarray, "h w 3"]) -> Look:
         combing=_combing(_middle(grey)),
         grey=small,
         colours=_colours(image),
+        contrast=_contrast(small),
     )
 
 
@@ -103,3 +115,12 @@ def _colours(image: np.ndarray) -> np.ndarray:
     level = np.clip(small * (128 / max(float(small.mean()), 1.0)), 0, 255).astype(np.uint8)
     counts = cv2.calcHist([level], [0, 1, 2], None, [BINS] * 3, [0, 256] * 3).ravel()
     return (counts / counts.sum()).astype(np.float64)
+
+
+def _contrast(grey: np.ndarray) -> np.ndarray:
+    scale = COARSE / max(grey.shape)
+    coarse = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.float32)
+    fine, rough = (cv2.GaussianBlur(coarse, (0, 0), sigma) for sigma in FINE)
+    square = cv2.resize(cv2.GaussianBlur((fine - rough) ** 2, (0, 0), SPREAD), PARTS, interpolation=cv2.INTER_AREA)
+    # Less than a grey level is noise, and so is the brightness of what is all but black.
+    return (np.maximum(square, 1) / max(float(coarse.mean()), 8) ** 2).ravel().astype(np.float64)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
 from jaxtri.errors import InputError
+from jaxtri.vision.dissolves import MIXED, Dissolves
 from jaxtri.vision.klt import KLT, FrameTracks
 from jaxtri.vision.pictures import Look, look
 from jaxtri.vision.video import Frame, FrameSource, ahead
@@ -61,6 +62,8 @@ class Survey:
         change: (t,) share of the picture whose colours are others than in the frame before, 0 to 1.
         start_flow: (t,) median flow, as a share of the width, since the first frame of which enough features are left.
         depth: (t,) where that flow suffices for a start: how much worse one homography fits than an epipolar geometry.
+        mixed: (t,) what a mixture of an earlier and a later picture leaves unexplained of its contrast, over what a
+            picture between the two does; 1 for none: see `jaxtri.vision.dissolves`.
         life: Median number of frames that a feature is followed for.
     """
 
@@ -86,6 +89,7 @@ class Survey:
     change: Float[np.ndarray, " t"]
     start_flow: Float[np.ndarray, " t"]
     depth: Float[np.ndarray, " t"]
+    mixed: Float[np.ndarray, " t"]
     life: float
 
     @property
@@ -132,6 +136,11 @@ class Survey:
         return found & ~_runs(found, 2)
 
     @property
+    def dissolves(self) -> Bool[np.ndarray, " t"]:
+        """Middle frames of what seem to be dissolves from one shot to another."""
+        return _runs(self.mixed < MIXED, 2)
+
+    @property
     def jumps(self) -> Bool[np.ndarray, " t"]:
         """Frames into which most features are lost although the shot goes on."""
         return self._broken & ~self.cuts
@@ -156,7 +165,7 @@ def survey(source: Iterable[Frame], *, max_frames: int | None = None, progress: 
     """
     known = source if isinstance(source, FrameSource) else None
     bar = tqdm(total=known.declared if known else None, unit="frame", disable=None if progress else True, leave=False)
-    rows, features, size, before = [], _Features(), (0, 0), None
+    rows, features, dissolves, size, before = [], _Features(), Dissolves(), (0, 0), None
     looked = contextlib.closing(ahead(_looked(islice(source, max_frames))))
     with contextlib.closing(bar), contextlib.suppress(KeyboardInterrupt), looked as frames:
         for frame, now in frames:
@@ -165,6 +174,7 @@ def survey(source: Iterable[Frame], *, max_frames: int | None = None, progress: 
             compared = (np.nan, np.nan) if before is None else now.against(before)
             rows.append((frame.index, frame.time_s, *shown, *features.add(frame), *compared))
             before = now
+            dissolves.add(now)
             bar.update()
     if not rows:
         raise InputError("there are no frames to look at")
@@ -182,6 +192,7 @@ def survey(source: Iterable[Frame], *, max_frames: int | None = None, progress: 
         timed=known is None or known.timed,
         turned_deg=0 if known is None else known.turned_deg,
         pixel_aspect=1.0 if known is None else known.pixel_aspect,
+        mixed=np.array(dissolves.mixed),
         life=features.life,
         **arrays,
     )

@@ -11,6 +11,7 @@ from jaxtri.cli import main
 from jaxtri.errors import InputError
 from jaxtri.odometry.settings import StartSettings
 from jaxtri.output.check import check_text, findings, verdict
+from jaxtri.vision.dissolves import MIXED, mixture
 from jaxtri.vision.klt import KLT
 from jaxtri.vision.pictures import look
 from jaxtri.vision.survey import COMMON, FLOW, POINTS, survey
@@ -64,6 +65,13 @@ def test_a_clean_clip_has_no_fault():
     assert found.startable
     start = StartSettings()
     assert (start.points, start.common, start.flow) == (POINTS, COMMON, FLOW)
+
+
+def dissolving(length):
+    """Another shot, moving the other way, that comes through the first for so many frames from the sixth on."""
+    first, second = images(), [np.ascontiguousarray(255 - image[::-1, ::-1]) for image in images()[::-1]]
+    shares = np.clip((np.arange(N) - 5) / (length + 1), 0, 1)
+    return [cv2.addWeighted(a, 1 - s, b, s, 0) for a, b, s in zip(first, second, shares, strict=True)]
 
 
 FAULTS = {
@@ -166,3 +174,34 @@ def test_the_command_line_says_it_and_writes_it(tmp_path, capsys):
             main(["check", *arguments])
         assert stop.value.code == 2
         assert "jaxtri: error:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("length", [6, 10])
+def test_a_dissolve_is_seen_where_it_is_and_a_haze_or_a_blur_is_none(length):
+    found = surveyed(dissolving(length))
+    at = np.flatnonzero(found.dissolves)
+    assert len(at) >= length // 3
+    assert at.min() > 5
+    assert at.max() < 5 + length + 1
+    (finding,) = (f for f in findings(found) if "dissolve" in f.seen)
+    assert 3 <= int(finding.remedy.split("--max-frames ")[1].split()[0]) <= at.min()
+    for change in (lambda image: cv2.addWeighted(image, 0.5, np.full_like(image, 140), 0.5, 0), smeared):
+        assert not surveyed(changed(range(7, 7 + length), change)).dissolves.any()
+
+
+def textured(seed):
+    """Noise of its own colour and strength in each part."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.normal(size=(60, 80, 1)) * cv2.resize(rng.uniform(5, 40, (3, 4)), (80, 60))[..., None]
+    tint = cv2.resize(rng.uniform(60, 190, (3, 4, 3)), (80, 60))
+    return cv2.resize(np.clip(tint + coarse, 0, 255), (320, 240)).astype(np.uint8)
+
+
+def test_a_mixture_is_told_by_its_contrast():
+    """Of two unrelated textures it is the mixture, by the shares that it was made with; what lies between is none."""
+    a, b, c = (textured(seed) for seed in range(3))
+    half = look(cv2.addWeighted(a, 0.5, b, 0.5, 0))
+    assert mixture(look(a), half, look(b)) < MIXED
+    assert mixture(look(b), half, look(a)) < MIXED
+    assert mixture(look(a), look(c), look(b)) == 1
+    assert mixture(look(a), look(cv2.addWeighted(a, 0.98, b, 0.02, 0)), look(b)) == 1
