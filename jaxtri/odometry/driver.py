@@ -30,7 +30,7 @@ from jaxtri.odometry.recorder import Recorder
 from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
 from jaxtri.odometry.slots import Slotted, slotted
-from jaxtri.odometry.start import BasePair, Observations, Start, fill, find, hold, short_lived, too_slow
+from jaxtri.odometry.start import BasePair, Observations, Start, Way, fill, find, hold, short_lived, too_slow
 from jaxtri.odometry.structure import Points, keep, no_points
 from jaxtri.trajectory import Trajectory
 
@@ -101,6 +101,7 @@ class Odometry(Archived):
     _search: Future[_Begun | Start] | None = field(default=None, init=False, repr=False, metadata={"saved": False})
     _follower: Follower | None = field(default=None, init=False, repr=False)
     _points: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+    _way: Way | None = field(default=None, init=False, repr=False)
     _tried: tuple[int, float] = field(default=(-1, 0.0), init=False, repr=False)  # first frame and flow of an attempt
     _depth: float = field(default=1.0, init=False, repr=False)
     _changes: int = field(default=0, init=False, repr=False)
@@ -290,6 +291,7 @@ class Odometry(Archived):
                 continue
             report = self._follower.follow(frame, self._dt(frame.index))
             self.poses[frame.index] = FramePose.of(frame.time, report)
+            self._recorder.judge(frame.index, np.asarray(report.moving))
             outliers.append(frame.ids[np.asarray(report.drop)])
             if self.poses[frame.index].status is Status.LOST:
                 self._lose(frame)
@@ -309,9 +311,9 @@ class Odometry(Archived):
         if len(self._waiting) < 2:
             self.reason = short_lived(self._start, gone, now)
             return
-        first, common = self._waiting[0], self._waiting[0].common(now)
-        width = (self.camera.width or 0) / float(self.camera.focal)
-        flow = float(np.median(np.linalg.norm(now.u[common] - first.u[common], axis=1))) / width
+        first, width = self._waiting[0], (self.camera.width or 0) / float(self.camera.focal)
+        self._way = Way.of(self._waiting, self._way)
+        flow = self._way.flow / width
         tried, before = self._tried
         if flow < self._start.flow:
             self.reason = self.reason if tried == first.index else too_slow(self._start, flow, first)

@@ -27,6 +27,8 @@ GAUGE = 1e-6
 START_VELOCITY = 0.05
 # Variance of the noise over what it was taken for, that a frame may show at most: a bad frame does not rule the next.
 SUDDEN = 10.0
+# How fast a track that is not measured is trusted again, over how fast one that does not agree loses trust.
+FORGIVING = 0.1
 # Inverse depth (1 / scene units) from which a point counts as infinitely far: what is divided by it stays finite.
 FARTHEST = 1e-9
 
@@ -138,6 +140,19 @@ def found_noise(
     shown = median(distance, measured) / (2 * math.log(2))
     share = jnp.clip(shown, 1 / SUDDEN, SUDDEN) ** (settings.noise_gain / 2)
     return jnp.maximum(noise * share, 1.0)
+
+
+def agreement(
+    settings: Settings, agreed: Float[Array, " n"], said: ekf.Diagnostics, measured: Bool[Array, " n"]
+) -> Float[Array, " n"]:
+    """Share of the latest frames that each track has agreed with, once one more is `measured`.
+
+    A track of which that is less than half moves by itself, or is followed wrongly. It stays out until it is trusted
+    again, a tenth as fast as it lost trust: of what moves, new points would agree again and again for some frames.
+    """
+    gain = settings.suspicion
+    now = jnp.where(said.weights > 0, 1.0, 0.0).astype(agreed.dtype)
+    return jnp.where(measured, agreed + gain * (now - agreed), agreed + FORGIVING * gain * (1 - agreed))
 
 
 def median(x: Float[Array, " n"], mask: Bool[Array, " n"], without: float = 1.0) -> Float[Array, ""]:

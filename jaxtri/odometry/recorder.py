@@ -34,6 +34,11 @@ class Recorder:
         if self.on:
             self.tracks.append(tracks)
 
+    def judge(self, frame: int, moving: np.ndarray) -> None:
+        """Which tracks (c,) of a frame move by themselves."""
+        if self.on:
+            self.tracks[frame] = self.tracks[frame]._replace(moving=moving)
+
     def stop(self, frame: int, begun: list[BasePair]) -> None:
         """The camera is lost in this frame; `begun` are the base pairs since the first."""
         if self.lost is None:
@@ -49,7 +54,7 @@ class Recorder:
         frames = np.full((len(pairs), max(1, *map(len, measured))), -1)
         for row, those in zip(frames, measured, strict=True):
             row[: len(those)] = those
-        pixels, visible, ids, quality = (np.stack(x) for x in zip(*kept, strict=True))
+        pixels, visible, ids, quality, _ = (np.stack(x) for x in zip(*kept, strict=True))
         return Recording(
             jnp.asarray(pixels, dtype),
             jnp.asarray(visible),

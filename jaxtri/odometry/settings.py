@@ -113,6 +113,9 @@ class Settings(eqx.Module):
             (`benchmarks/tuning.py`).
         noise_gain: Share by which a frame moves the noise that is found (`Base.TRACKS`): what the points are taken to
             have is `sigma` or, where they show more, that. 0 keeps `sigma`. 1 believes each frame by itself.
+        suspicion: Share by which a frame moves what is thought of a track that it measures (`Base.TRACKS`): one that
+            agrees with less than half of the latest frames moves by itself, or is followed wrongly, and is left out
+            for a while. At 0.25 three frames in a row are enough. 0 leaves none out.
         passes: Linearisations of an update (static). Eight bring the weights of `robust` from their start to their end.
         refinements: Steps by which the window of keyframes is improved when one is made (static). A keyframe begins
             nearly right, and those before it have been improved already.
@@ -135,6 +138,7 @@ class Settings(eqx.Module):
     robust: ekf.Robust
     point_noise: PointNoise | None = None
     noise_gain: Float[Array, ""] = eqx.field(default=0.2, converter=number)
+    suspicion: Float[Array, ""] = eqx.field(default=0.25, converter=number)
     passes: int = eqx.field(static=True, default=8)
     refinements: int = eqx.field(static=True, default=1)
 
@@ -167,6 +171,7 @@ class Settings(eqx.Module):
         return cls(
             sigma=noise_px / focal,
             noise_gain=scalar(0.2),
+            suspicion=scalar(0.25),
             correlation=scalar(0.9),
             calibration=scalar(calibration),
             acceleration=scalar(0.2),
@@ -193,11 +198,11 @@ class StartSettings:
     """When a base pair is good enough to start from; see `jaxtri.vision.hypotheses`.
 
     Attributes:
-        flow: Median flow between the two frames, as a share of the image width, from which a start is tried. A start on
-            two consecutive frames, as in the paper, has poor depths: in a prototype a single pair had 2.97 times the
-            error of `pnp` then, and 1.9 times with 3.5 % of the width.
-        parallax_deg: Median angle in degrees between the two rays of a point that a start needs. Below it a camera that
-            only turns may look like one that moves. Higher waits longer and starts from better depths.
+        flow: Flow between the two frames that a quarter of the tracks exceed, as a share of the image width, from which
+            a start is tried. A start on two consecutive frames, as in the paper, has poor depths: in a prototype a
+            single pair had 2.97 times the error of `pnp` then, and 1.9 times with 3.5 % of the width (the median).
+        parallax_deg: Angle in degrees between the two rays of a point that a quarter of the points must exceed. Below
+            it a camera that only turns may look like one that moves. Higher waits longer and starts from better depths.
         points: Fewest tracks that must agree on the motion. Higher refuses starts that chance agreement may have made.
         common: Share of the first frame's tracks that must be left in the second. Below it a later frame becomes the
             first one.
@@ -210,8 +215,8 @@ class StartSettings:
         poselib: Let the pose that PoseLib finds compete with those of OpenCV. Off: it needs the extra `init`.
     """
 
-    flow: float = 0.035
-    parallax_deg: float = 1.0
+    flow: float = 0.05
+    parallax_deg: float = 1.4
     points: int = 20
     common: float = 0.15
     restart: float = 0.35
@@ -224,7 +229,7 @@ class StartSettings:
     def of(cls, base: Base | str, **changes: Any) -> "StartSettings":
         """The defaults of a kind of base; the paper's starts from the first two frames that move at all."""
         if Base(base) is Base.PAPER:
-            changes = {"flow": 0.003, "parallax_deg": 0.1, "eight_point": True} | changes
+            changes = {"flow": 0.004, "parallax_deg": 0.14, "eight_point": True} | changes
         return cls(**changes)
 
 
@@ -241,6 +246,7 @@ class Report(NamedTuple):
         drop: (n,) tracks that are outliers: their slots may be filled anew.
         diagnostics: What the update found; see `jaxtri.Diagnostics`.
         noise: Standard deviation that the points were taken to have, over `Settings.sigma`.
+        moving: (n,) tracks that move by themselves, or are followed wrongly: for a while they are not measured.
     """
 
     pose: SE3
@@ -251,3 +257,4 @@ class Report(NamedTuple):
     drop: Bool[Array, " n"]
     diagnostics: ekf.Diagnostics
     noise: Float[Array, ""]
+    moving: Bool[Array, " n"]

@@ -155,7 +155,8 @@ def step(
     new = new._replace(structure=structure)
     status = judged(found.status, covariance, found.diagnostics)
     one = jnp.ones((), observed.dtype)
-    return new, Report(pose, covariance, status, jnp.asarray(False), _parallax(new), drop, found.diagnostics, one)
+    never, none = jnp.asarray(False), jnp.zeros_like(drop)
+    return new, Report(pose, covariance, status, never, _parallax(new), drop, found.diagnostics, one, none)
 
 
 def _parallax(state: State) -> Float[Array, ""]:
@@ -287,4 +288,4 @@ def second_report(state: State) -> Report:
     diagnostics = ekf.Diagnostics(unknown, unknown, count, count, inside.astype(nothing.dtype), nothing)
     status = jnp.asarray(int(Status.TRACKING))
     keyframe, angle, drop = jnp.asarray(True), _parallax(state), jnp.zeros_like(inside)
-    return Report(*world_pose(state), status, keyframe, angle, drop, diagnostics, jnp.ones_like(angle))
+    return Report(*world_pose(state), status, keyframe, angle, drop, diagnostics, jnp.ones_like(angle), drop)

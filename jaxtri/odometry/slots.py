@@ -14,6 +14,7 @@ class Slotted(NamedTuple):
     visible: np.ndarray  # (c,) bool
     ids: np.ndarray  # (c,) int64, -1 where nothing is visible
     quality: np.ndarray  # (c, 2) forward-backward error in pixels, smaller eigenvalue of the patch; NaN if unknown
+    moving: np.ndarray  # (c,) bool, found to move by itself
 
 
 def place(held: np.ndarray, ids: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -59,7 +60,11 @@ def slotted(
     rows, slots = np.flatnonzero(seen), slot[seen]
     capacity = len(held)
     found = Slotted(
-        np.zeros((capacity, 2)), np.zeros(capacity, bool), np.full(capacity, -1), np.full((capacity, 2), np.nan)
+        np.zeros((capacity, 2)),
+        np.zeros(capacity, bool),
+        np.full(capacity, -1),
+        np.full((capacity, 2), np.nan),
+        np.zeros(capacity, bool),
     )
     found.pixels[slots], found.visible[slots], found.ids[slots] = pixels[rows], True, ids[rows]
     if quality is not None:

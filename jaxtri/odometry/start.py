@@ -14,7 +14,7 @@ from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.pose import compose, identity
 from jaxtri.odometry import track_pairs
 from jaxtri.odometry.settings import Report, Settings, StartSettings
-from jaxtri.vision.hypotheses import GATE, Hypothesis, hypotheses
+from jaxtri.vision.hypotheses import FAR, GATE, Hypothesis, hypotheses
 
 # Hypotheses up to RIVAL_SHARE times the cost of the best, and RIVAL_MORE, explain the pair about equally well. Before a
 # plane the two poses cost the same; the margin keeps noise from deciding between them.
@@ -50,6 +50,40 @@ class Observations:
     def common(self, other: "Observations") -> np.ndarray:
         """Slots that hold the same track in both frames."""
         return self.visible & other.visible & (self.ids == other.ids)
+
+
+class Way(NamedTuple):
+    """How far the tracks of a first frame have gone since, each as long as it was followed.
+
+    Not of those alone that are left: what goes along with the camera, a car ahead, stays in the picture longest.
+
+    Attributes:
+        first: The frame.
+        last: Number of the frame up to which they were followed.
+        length: (n,) in normalised image units.
+    """
+
+    first: Observations
+    last: int
+    length: np.ndarray
+
+    @classmethod
+    def of(cls, frames: list[Observations], before: "Way | None") -> "Way":
+        """From the first of `frames` to the last; `before` is that up to an earlier one, if it has the same first."""
+        first, *later = frames
+        if before is None or before.first.index != first.index:
+            before = cls(first, first.index, np.zeros(len(first.ids)))
+        length = before.length.copy()
+        for frame in later:
+            if frame.index > before.last:
+                common = first.common(frame)
+                length[common] = np.linalg.norm(frame.u[common] - first.u[common], axis=1)
+        return cls(first, frames[-1].index, length)
+
+    @property
+    def flow(self) -> float:
+        """The length that a quarter of them exceed."""
+        return float(np.quantile(self.length[self.first.visible], FAR))
 
 
 class Start(NamedTuple):
@@ -126,7 +160,7 @@ def find(settings: Settings, start: StartSettings, frames: list[Observations]) -
 
 def too_slow(start: StartSettings, flow: float, first: Observations) -> str:
     """Why there is no start yet where the picture has hardly moved since `first`."""
-    seen = f"the median flow since frame {first.index} is {flow:.1%} of the image width, {start.flow:.1%} needed"
+    seen = f"the flow since frame {first.index} is {flow:.1%} of the image width, {start.flow:.1%} needed"
     return f"{seen}: the camera stands still or moves slowly; give a longer sequence, in which the flow adds up"
 
 

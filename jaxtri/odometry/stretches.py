@@ -12,6 +12,7 @@ from jaxtri.odometry.slots import Slotted
 # chunk, so that what is worked out of it stays in a cache; and for chunks of a layer, at least: twice as many as most
 # sequences of a few hundred frames need, so that they share what is compiled.
 SIZES, PLACES, CHUNKS = (8, 32), 4096, 32
+LEFT = 0.5  # share of a keyframe's tracks below which the next one is due: on a road most live for a few frames only
 
 
 def segments(odometry: Odometry) -> list[tuple[int, int]]:
@@ -45,7 +46,7 @@ class Segment(NamedTuple):
         poses = odometry.poses[first:end]
         cameras = (odometry.camera_at(p.time) for p in poses)
         u = np.stack([np.asarray(normalise(c, t.pixels.astype(dtype))) for c, t in zip(cameras, tracks, strict=True)])
-        seen = np.stack([t.visible for t in tracks]) & np.isfinite(u).all(axis=2)
+        seen = np.stack([t.visible & ~t.moving for t in tracks]) & np.isfinite(u).all(axis=2)
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
         times = np.array([p.time for p in poses]) / (odometry.frame_time or 1.0)
         return cls(
@@ -61,12 +62,16 @@ class Segment(NamedTuple):
 def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
     """Frames between which the tracks have moved, the first and the last among them."""
     flow, common = float(settings.keyframe_flow), float(settings.keyframe_common)
-    keys = [0]
+    keys, way = [0], np.zeros(segment.seen.shape[1])
     for k in range(1, len(segment.u)):
-        both = (segment.ids[k] == segment.ids[keys[-1]]) & segment.seen[k]
-        shift = np.linalg.norm(segment.u[k][both] - segment.u[keys[-1]][both], axis=1)
-        if segment.measured[k] and (both.sum() < common or np.median(shift) > flow):
+        key = keys[-1]
+        both = (segment.ids[k] == segment.ids[key]) & segment.seen[k]
+        way[both] = np.linalg.norm(segment.u[k][both] - segment.u[key][both], axis=1)
+        # Each as far as it was followed: what goes along with the camera stays in the picture longest.
+        moved = np.median(way[segment.seen[key]]) > flow
+        if segment.measured[k] and (moved or both.sum() < max(common, LEFT * segment.seen[key].sum())):
             keys.append(k)
+            way[:] = 0
     last = len(segment.u) - 1
     return np.array(keys if keys[-1] == last else [*keys, last])
 

@@ -26,7 +26,18 @@ from jaxtri.geometry.pose import identity, multiply
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.motion import Twist
 from jaxtri.odometry.keyframes import carry, total
-from jaxtri.odometry.measuring import FARTHEST, GAUGE, START_VELOCITY, found_noise, judged, measure, median, noise_scale
+from jaxtri.odometry.measuring import (
+    FARTHEST,
+    GAUGE,
+    MINORITY,
+    START_VELOCITY,
+    agreement,
+    found_noise,
+    judged,
+    measure,
+    median,
+    noise_scale,
+)
 from jaxtri.odometry.settings import Report, Settings
 from jaxtri.odometry.window import Refined, Window, add, start
 
@@ -70,6 +81,7 @@ class State(NamedTuple):
         depth: Median depth of the scene, scene units.
         coasted: Frames since the last update that was taken.
         noise: Standard deviation of a tracked point over `Settings.sigma`, as the frames so far have shown it.
+        agreed: (n,) share of the latest frames that each track has agreed with, the latest of them counting most.
     """
 
     belief: ekf.Belief[Twist]
@@ -82,6 +94,7 @@ class State(NamedTuple):
     depth: Float[Array, ""]
     coasted: Int[Array, ""]
     noise: Float[Array, ""]
+    agreed: Float[Array, " n"]
 
 
 def _louder(settings: Settings, noise: Float[Array, ""]) -> Settings:
@@ -145,6 +158,7 @@ def init(
         depth,
         jnp.asarray(0, jnp.int32),
         noise,
+        jnp.ones(len(first), dtype),
     )
 
 
@@ -221,9 +235,12 @@ def step(
         belief.covariance,
         *_owed(model, belief.mean, items, tracks, weights, scale),
     )
-    visible = visible & ~drop
-    tracks = _only(tracks, ~drop)
-    held = state.held & keep & ~drop
+    agreed = jnp.where(keep, state.agreed, 1.0)
+    agreed = agreement(settings, agreed, found.diagnostics, ok & mask)
+    moving = visible & (agreed < MINORITY)
+    visible = visible & ~drop & ~moving
+    tracks = _only(tracks, ~drop & ~moving)
+    held = state.held & keep & ~drop & ~moving
 
     flow = median(jnp.sqrt(jnp.sum((observed - state.seen) ** 2, axis=-1)), held)
 
@@ -245,12 +262,13 @@ def step(
         depth=depth,
         coasted=found.coasted,
         noise=noise,
+        agreed=agreed,
     )
     new = jax.lax.cond(keyframe, lambda: _rebase(settings, plain, observed, visible), lambda: plain)
     covariance = total(new.belief.covariance[:6, :6], new.covariance, new.sensitivity)
     status, said = judged(found.status, covariance, found.diagnostics), found.diagnostics
     parallax = median(tracks.angle, tracks.usable, jnp.nan)
-    return new, Report(new.belief.mean.pose, covariance, status, keyframe, parallax, drop, said, state.noise)
+    return new, Report(new.belief.mean.pose, covariance, status, keyframe, parallax, drop, said, state.noise, moving)
 
 
 def _owed(

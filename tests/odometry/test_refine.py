@@ -64,6 +64,35 @@ def test_refined_poses_are_nearer_and_the_rest_stays(run):
     assert part["converged"]
 
 
+def test_looks_at_what_moves_by_itself_are_left_out(run):
+    _, odometry = run
+    first, moved = odometry.base_pair[0], odometry.base_pair[0] + 20
+    before, whole = odometry.tracks[moved], stretches.Segment.of(odometry, first, 40)
+    lone = np.arange(len(before.visible)) % 5 == 0
+    odometry.tracks[moved] = before._replace(moving=lone)
+    try:
+        without = stretches.Segment.of(odometry, first, 40)
+    finally:
+        odometry.tracks[moved] = before
+    expected = whole.seen.copy()
+    expected[20] &= ~lone
+    np.testing.assert_array_equal(without.seen, expected)
+    assert (without.seen != whole.seen).sum() > 10
+
+
+def test_a_keyframe_comes_where_half_of_the_tracks_are_gone(run):
+    _, odometry = run
+    settings, whole = odometry.settings, stretches.Segment.of(odometry, odometry.base_pair[0], 40)
+    # All but what hardly moves ends one frame after each third: what is left would make no keyframe for long.
+    shift = np.linalg.norm(whole.u[-1] - whole.u[0], axis=1)
+    lasting = np.argsort(np.where(whole.seen.all(axis=0), shift, np.inf))[: int(settings.keyframe_common) + 10]
+    seen = np.zeros_like(whole.seen)
+    seen[:, lasting] = True
+    seen[:2] = whole.seen[:2]
+    still = whole._replace(u=np.broadcast_to(whole.u[0], whole.u.shape), seen=seen)
+    np.testing.assert_array_equal(stretches.keyframes(settings, still), [0, 2, len(seen) - 1])
+
+
 def test_frames_beside_a_jump_between_two_keyframes():
     """A turn of 16 degrees from one frame to the next, which two fifths of the tracks do not survive."""
     t, rng = np.arange(40)[:, None], np.random.default_rng(0)
@@ -152,5 +181,5 @@ def test_what_cannot_be_refined_says_so():
     still = Odometry(tracks.camera, record=True)
     for k in range(5):
         still.add(tracks.pixels[0], tracks.visible[0], float(k))
-    with pytest.raises(InitialisationError, match="median flow"):
+    with pytest.raises(InitialisationError, match="the flow since"):
         refine(still)

@@ -130,7 +130,8 @@ def test_likelihoods_are_those_of_pixels():
         )
         pose, none = SE3.identity((2,)), jnp.zeros(2, bool)
         dropped = jnp.zeros((2, 5), bool)
-        return Report(pose, jnp.zeros((2, 6, 6)), jnp.ones(2, int), none, jnp.zeros(2), dropped, said, jnp.ones(2))
+        zero = jnp.zeros(2)
+        return Report(pose, jnp.zeros((2, 6, 6)), jnp.ones(2, int), none, zero, dropped, said, jnp.ones(2), dropped)
 
     report, likelihood = reported(), jax.jit(replay.negative_log_likelihood)
     jacobians = jax.jit(jax.vmap(jax.vmap(jax.jacrev(lambda x: camera.to_normalised(x)))))(pixels[1:])

@@ -5,9 +5,34 @@ import pytest
 
 from jaxtri import Camera, Odometry
 from jaxtri.errors import InitialisationError
+from jaxtri.odometry.start import Observations, Way
 
 RNG = np.random.default_rng(0)
 CAMERA = Camera.from_parameters(280, 280, 159.5, 119.5, width=320, height=240)
+
+
+def observations(index, u, ids):
+    none = np.full((len(ids), 2), np.nan)
+    return Observations(index, float(index), u, ids >= 0, ids, none)
+
+
+def test_a_track_that_has_ended_counts_as_far_as_it_was_followed():
+    ids, u = np.arange(40), RNG.uniform(-0.5, 0.5, (40, 2))
+    # Ten go along with the camera; the others move by .01 to .03 a frame, and none of these is left after frame 3.
+    step = np.r_[np.zeros(10), np.linspace(0.01, 0.03, 30)]
+    frames = [
+        observations(k, u + k * step[:, None] * [1, 0], np.where((step > 0) & (k > 3), -1, ids)) for k in range(8)
+    ]
+    expected = np.quantile(3 * step, 0.75)
+    way = None
+    for k in range(1, 8):
+        way = Way.of(frames[: k + 1], way)
+    assert way is not None
+    for each in (way, Way.of(frames, None)):
+        np.testing.assert_allclose(each.length, 3 * step, atol=1e-15)
+        np.testing.assert_allclose(each.flow, expected, rtol=1e-12)
+    # From another first frame nothing is kept.
+    np.testing.assert_array_equal(Way.of(frames[4:], way).length[:10], 0)
 
 
 def why(frames, ids):
@@ -42,7 +67,7 @@ def test_many_features_that_do_not_last_are_not_called_few():
 def test_a_camera_that_hardly_moves_is_not_told_to_ask_for_less_parallax():
     still = points(300)
     message = why([still + 0.5 * k for k in range(4)], [np.arange(300)] * 4)
-    assert "median flow since frame 0 is 0.7% of the image width, 3.5% needed" in message
+    assert "the flow since frame 0 is 0.7% of the image width, 5.0% needed" in message
     assert "longer sequence" in message
     assert "less parallax" not in message
 

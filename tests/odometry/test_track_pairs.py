@@ -231,6 +231,23 @@ def test_tracks_that_jump_are_given_up_and_the_pose_stays_right(noisy):
     assert position_errors(scene, reports).max() < 0.03
 
 
+def test_tracks_that_move_by_themselves_are_left_out_as_if_they_were_gone():
+    movers, begun = [0, 10, 20, 30, 40, 50], 9  # none of them changes its point
+    moving, without = Scene(), Scene()
+    # To and fro, by more than the gate leaves; and none is given up at once, as what is far off is.
+    moving.observed[begun:, movers, 1] += (5 / 500 * (-1.0) ** np.arange(begun, FRAMES))[:, None]
+    without.visible[begun:, movers] = False
+    patient = eqx.tree_at(lambda s: s.outlier, SETTINGS, jnp.asarray(1e6))
+    (_, found), (_, gone) = follow(moving, settings=patient), follow(without, settings=patient)
+    # Three frames in a row are enough; reports begin with frame 1.
+    assert not found.moving[: begun + 1].any()
+    assert found.moving[begun + 1 :].any(axis=0)[movers].all()
+    assert not np.delete(found.moving, movers, axis=1).any()
+    np.testing.assert_allclose(position_errors(moving, found), position_errors(without, gone), atol=1e-3)
+    trusting = eqx.tree_at(lambda s: s.suspicion, patient, jnp.asarray(0.0))
+    assert not follow(moving, settings=trusting)[1].moving.any()
+
+
 def test_a_window_needs_four_keyframes():
     scene = Scene()
     with pytest.raises(InputError, match="at least 4"):
