@@ -57,7 +57,7 @@ class _Tracker:
     find_overlays: bool = True
     """Find bars, logos, a bonnet by themselves, and ignore them."""
     min_parallax: Annotated[
-        float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 1.4; 0.14 with --base paper)")
+        float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 1; 0.1 with --base paper)")
     ] = None
     """Least parallax of a start."""
 

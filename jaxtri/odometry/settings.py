@@ -198,11 +198,13 @@ class StartSettings:
     """When a base pair is good enough to start from; see `jaxtri.vision.hypotheses`.
 
     Attributes:
-        flow: Flow between the two frames that a quarter of the tracks exceed, as a share of the image width, from which
-            a start is tried. A start on two consecutive frames, as in the paper, has poor depths: in a prototype a
-            single pair had 2.97 times the error of `pnp` then, and 1.9 times with 3.5 % of the width (the median).
-        parallax_deg: Angle in degrees between the two rays of a point that a quarter of the points must exceed. Below
-            it a camera that only turns may look like one that moves. Higher waits longer and starts from better depths.
+        flow: Flow between the two frames, as a share of the image width, from which a start is tried: half of the
+            tracks that are left must exceed it, or a quarter of all, as far as they were followed, 1.4 times. A start
+            on two consecutive frames, as in the paper, has poor depths: in a prototype a single pair had 2.97 times the
+            error of `pnp` then, and 1.9 times with 3.5 % of the width.
+        parallax_deg: Angle in degrees between the two rays of a point that half of the points must exceed, or a quarter
+            1.4 times. Below it a camera that only turns may look like one that moves. Higher waits longer and starts
+            from better depths.
         points: Fewest tracks that must agree on the motion. Higher refuses starts that chance agreement may have made.
         common: Share of the first frame's tracks that must be left in the second. Below it a later frame becomes the
             first one.
@@ -215,8 +217,8 @@ class StartSettings:
         poselib: Let the pose that PoseLib finds compete with those of OpenCV. Off: it needs the extra `init`.
     """
 
-    flow: float = 0.05
-    parallax_deg: float = 1.4
+    flow: float = 0.035
+    parallax_deg: float = 1.0
     points: int = 20
     common: float = 0.15
     restart: float = 0.35
@@ -229,7 +231,7 @@ class StartSettings:
     def of(cls, base: Base | str, **changes: Any) -> "StartSettings":
         """The defaults of a kind of base; the paper's starts from the first two frames that move at all."""
         if Base(base) is Base.PAPER:
-            changes = {"flow": 0.004, "parallax_deg": 0.14, "eight_point": True} | changes
+            changes = {"flow": 0.003, "parallax_deg": 0.1, "eight_point": True} | changes
         return cls(**changes)
 
 

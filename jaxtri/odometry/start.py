@@ -14,7 +14,7 @@ from jaxtri.estimation.two_view import TwoView
 from jaxtri.geometry.pose import compose, identity
 from jaxtri.odometry import track_pairs
 from jaxtri.odometry.settings import Report, Settings, StartSettings
-from jaxtri.vision.hypotheses import FAR, GATE, Hypothesis, hypotheses
+from jaxtri.vision.hypotheses import FARTHER, GATE, SHARES, Hypothesis, hypotheses
 
 # Hypotheses up to RIVAL_SHARE times the cost of the best, and RIVAL_MORE, explain the pair about equally well. Before a
 # plane the two poses cost the same; the margin keeps noise from deciding between them.
@@ -55,35 +55,39 @@ class Observations:
 class Way(NamedTuple):
     """How far the tracks of a first frame have gone since, each as long as it was followed.
 
-    Not of those alone that are left: what goes along with the camera, a car ahead, stays in the picture longest.
-
     Attributes:
         first: The frame.
         last: Number of the frame up to which they were followed.
         length: (n,) in normalised image units.
+        left: (n,) tracks that are still followed.
     """
 
     first: Observations
     last: int
     length: np.ndarray
+    left: np.ndarray
 
     @classmethod
     def of(cls, frames: list[Observations], before: "Way | None") -> "Way":
         """From the first of `frames` to the last; `before` is that up to an earlier one, if it has the same first."""
         first, *later = frames
         if before is None or before.first.index != first.index:
-            before = cls(first, first.index, np.zeros(len(first.ids)))
+            before = cls(first, first.index, np.zeros(len(first.ids)), first.visible)
         length = before.length.copy()
         for frame in later:
             if frame.index > before.last:
                 common = first.common(frame)
                 length[common] = np.linalg.norm(frame.u[common] - first.u[common], axis=1)
-        return cls(first, frames[-1].index, length)
+        return cls(first, frames[-1].index, length, first.common(frames[-1]))
 
     @property
     def flow(self) -> float:
-        """The length that a quarter of them exceed."""
-        return float(np.quantile(self.length[self.first.visible], FAR))
+        """The length that half of those that are left exceed; or a quarter of all 1.4 times, if that is more.
+
+        What goes along with the camera, a car ahead, stays in the picture longest, and tells of no motion.
+        """
+        left, quarter = self.length[self.left], np.quantile(self.length[self.first.visible], SHARES[1])
+        return max(float(np.median(left)) if len(left) else 0.0, float(quarter) / FARTHER)
 
 
 class Start(NamedTuple):

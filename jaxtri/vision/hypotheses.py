@@ -17,9 +17,9 @@ HYPOTHESES = 8  # their number is fixed, so that one compilation serves
 CONFIDENCE = 0.9999  # that a robust estimator drew a sample without outliers: a start is rare, so it may take time
 LEAST = 8  # tracks: what the 8-point algorithm needs, and fewer leave a pose with hardly anything to be judged by
 GATE = 4.0  # sigmas of Sampson distance within which a track agrees; beyond, all cost the same
-# Quantile of flow and parallax by which motion is judged: what is far behind, or goes along with the camera, shows
-# none, and may be most of what is seen.
-FAR = 0.75
+# Quantiles of flow and parallax by which motion is judged: that of half of the tracks, or FARTHER times that of a
+# quarter. What is far behind, or goes along with the camera, shows none, and may be most of what is seen.
+SHARES, FARTHER = (0.5, 0.75), 1.4
 WORST = 4.0  # times the cost of the best, above which a hypothesis is not refined a second time
 AHEAD = 0.9  # share of a plane's points that must lie before the camera: the rest may be noise
 FOCAL = 1000.0  # pixels, of the made-up camera for estimators whose own thresholds are made for pixels
@@ -37,7 +37,8 @@ class Hypothesis(NamedTuple):
         cost: Sum over the common tracks of the squared Sampson distances over sigma; 16 for a track that does not
             agree.
         inside: (n,) tracks within 4 sigmas and in front of both cameras.
-        parallax_deg: Angle in degrees between the two rays of a track that a quarter of these exceed.
+        parallax_deg: Angle in degrees between the two rays of a track that half of these exceed, or a quarter 1.4
+            times.
     """
 
     pose: two_view.TwoView
@@ -150,7 +151,8 @@ def _refine(
         inside = common & (jnp.abs(distance) < GATE) & (inverse > 0)
         cost = jnp.sum(jnp.where(common, jnp.where(inside, distance**2, GATE**2), 0.0))
         angle = jax.vmap(lambda a, b: parallax(a, b, R))(u1, u2)
-        return _Refined(pose, cost, inside, jnp.nanquantile(jnp.where(inside, angle, jnp.nan), FAR))
+        half, quarter = jnp.nanquantile(jnp.where(inside, angle, jnp.nan), jnp.asarray(SHARES, angle.dtype))
+        return _Refined(pose, cost, inside, jnp.maximum(half, quarter / FARTHER))
 
     def refine(hypothesis: tuple[Array, Array, Array, Array]) -> _Refined:
         wanted, *others = hypothesis

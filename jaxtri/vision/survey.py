@@ -12,12 +12,12 @@ from tqdm import tqdm
 
 from jaxtri.errors import InputError
 from jaxtri.vision.dissolves import MIXED, Dissolves
-from jaxtri.vision.hypotheses import FAR
+from jaxtri.vision.hypotheses import FARTHER, SHARES
 from jaxtri.vision.klt import KLT, FrameTracks
 from jaxtri.vision.pictures import Look, look
 from jaxtri.vision.video import Frame, FrameSource, ahead
 
-POINTS, COMMON, FLOW = 20, 0.15, 0.05
+POINTS, COMMON, FLOW = 20, 0.15, 0.035
 """What a start of `track` needs: tracks, share of the first frame's tracks, and flow as a share of the width."""
 
 # Found on real sequences, on faulty copies of them and on rendered clips. In brackets what those show that are fine.
@@ -61,8 +61,8 @@ class Survey:
         flow_px: (t,) their median motion, pixels.
         difference: (t,) mean absolute difference from the frame before, grey levels.
         change: (t,) share of the picture whose colours are others than in the frame before, 0 to 1.
-        start_flow: (t,) flow that a quarter of the features exceed, as a share of the width, since the first frame of
-            which enough are left.
+        start_flow: (t,) flow that half of the features exceed, or a quarter 1.4 times, as a share of the width, since
+            the first frame of which enough are left.
         depth: (t,) where that flow suffices for a start: how much worse one homography fits than an epipolar geometry.
         mixed: (t,) what a mixture of an earlier and a later picture leaves unexplained of its contrast, over what a
             picture between the two does; 1 for none: see `jaxtri.vision.dissolves`.
@@ -254,7 +254,8 @@ class _Features:
         if waiting:
             kept = _common(waiting[0], now)
             a, b = waiting[0].pixels[kept], now.pixels[kept]
-            flow = float(np.quantile(np.linalg.norm(b - a, axis=1), FAR)) / width
+            half, quarter = np.quantile(np.linalg.norm(b - a, axis=1), SHARES)
+            flow = max(float(half), float(quarter) / FARTHER) / width
             if flow >= FLOW:
                 depth = _depth(a, b)
                 waiting.clear()

@@ -23,14 +23,18 @@ def test_a_track_that_has_ended_counts_as_far_as_it_was_followed():
     frames = [
         observations(k, u + k * step[:, None] * [1, 0], np.where((step > 0) & (k > 3), -1, ids)) for k in range(8)
     ]
-    expected = np.quantile(3 * step, 0.75)
-    way = None
+    way, before = None, []
     for k in range(1, 8):
         way = Way.of(frames[: k + 1], way)
+        before.append(way.flow)
     assert way is not None
     for each in (way, Way.of(frames, None)):
         np.testing.assert_allclose(each.length, 3 * step, atol=1e-15)
-        np.testing.assert_allclose(each.flow, expected, rtol=1e-12)
+        np.testing.assert_array_equal(each.left, step == 0)
+        np.testing.assert_allclose(each.flow, np.quantile(3 * step, 0.75) / 1.4, rtol=1e-12)
+    # As long as all are left: the median, or the quartile over 1.4.
+    each = max(np.median(step), np.quantile(step, 0.75) / 1.4)
+    np.testing.assert_allclose(before[:3], [each, 2 * each, 3 * each], rtol=1e-12)
     # From another first frame nothing is kept.
     np.testing.assert_array_equal(Way.of(frames[4:], way).length[:10], 0)
 
@@ -67,7 +71,7 @@ def test_many_features_that_do_not_last_are_not_called_few():
 def test_a_camera_that_hardly_moves_is_not_told_to_ask_for_less_parallax():
     still = points(300)
     message = why([still + 0.5 * k for k in range(4)], [np.arange(300)] * 4)
-    assert "the flow since frame 0 is 0.7% of the image width, 5.0% needed" in message
+    assert "the flow since frame 0 is 0.7% of the image width, 3.5% needed" in message
     assert "longer sequence" in message
     assert "less parallax" not in message
 
