@@ -69,16 +69,15 @@ class Way(NamedTuple):
 
     @classmethod
     def of(cls, frames: list[Observations], before: "Way | None") -> "Way":
-        """From the first of `frames` to the last; `before` is that up to an earlier one, if it has the same first."""
-        first, *later = frames
+        """From the first of `frames`, in a row, to the last; `before` is that up to one of these, where it fits."""
+        first, now = frames[0], frames[-1]
         if before is None or before.first.index != first.index:
             before = cls(first, first.index, np.zeros(len(first.ids)), first.visible)
         length = before.length.copy()
-        for frame in later:
-            if frame.index > before.last:
-                common = first.common(frame)
-                length[common] = np.linalg.norm(frame.u[common] - first.u[common], axis=1)
-        return cls(first, frames[-1].index, length, first.common(frames[-1]))
+        for frame in frames[len(frames) - (now.index - before.last) :]:  # none is left out between them
+            common = first.common(frame)
+            length[common] = np.linalg.norm(frame.u[common] - first.u[common], axis=1)
+        return cls(first, now.index, length, first.common(now))
 
     @property
     def flow(self) -> float:

@@ -67,9 +67,9 @@ def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
         key = keys[-1]
         both = (segment.ids[k] == segment.ids[key]) & segment.seen[k]
         way[both] = np.linalg.norm(segment.u[k][both] - segment.u[key][both], axis=1)
+        few = both.sum() < max(common, LEFT * segment.seen[key].sum())
         # Each as far as it was followed: what goes along with the camera stays in the picture longest.
-        moved = np.median(way[segment.seen[key]]) > flow
-        if segment.measured[k] and (moved or both.sum() < max(common, LEFT * segment.seen[key].sum())):
+        if segment.measured[k] and (few or np.median(way[segment.seen[key]]) > flow):
             keys.append(k)
             way[:] = 0
     last = len(segment.u) - 1
