@@ -300,12 +300,13 @@ def _check(options: Track) -> None:
     least = {"features": 50, "overlap": 1, "max_frames": 1, "min_parallax": 0, "noise_px": 1e-6, "calibration_error": 0}
     given = options.flat()
     for name, low in least.items():
-        value = given[name]
-        if value is not None and not low <= value < float("inf"):
+        if (value := given[name]) is not None and not low <= value < float("inf"):
             raise InputError(f"--{name.replace('_', '-')} {value:g}: give a number of at least {low:g}")
     for name, words in {"base": ("tracks", "inherit", "paper"), "starts": ("opencv", "poselib")}.items():
         if given[name] not in words:
             raise InputError(f"--{name} {given[name]}: choose one of {', '.join(words)}")
+    if options.camera is None and (given["scale_camera"] or given["turn_camera"]):
+        raise InputError("--scale-camera and --turn-camera change what --camera gives: give --camera FILE, too")
     if options.out.exists() and not options.out.is_dir():
         raise InputError(f"--out {options.out} is a file: give a folder")
 
@@ -372,8 +373,7 @@ def _evaluate(options: Evaluate) -> None:
     from jaxtri.output.report import errors_text
     from jaxtri.trajectory import evaluate
 
-    pair = read_pair(options.estimate, options.groundtruth, options.times)
-    found = evaluate(*pair, with_scale=options.scale)
+    found = evaluate(*read_pair(options.estimate, options.groundtruth, options.times), with_scale=options.scale)
     print(errors_text(found))
     if options.json is not None:
         write_json(options.json, asdict(found))

@@ -160,6 +160,8 @@ def test_wrong_input_ends_with_a_message_and_exit_code_2(sequence, tmp_path, cap
     small = json.loads(camera.read_text()) | {"width": 640, "height": 640}
     (tmp_path / "small.json").write_text(json.dumps(small))
     assert "another aspect" in track(sequence, "--camera", tmp_path / "small.json", "--scale-camera")
+    for change in (["--turn-camera", "45"], ["--scale-camera"]):
+        assert "give --camera FILE" in track(sequence, "--fov", "60", *change)
     assert not (tmp_path / "out").exists()
 
 
