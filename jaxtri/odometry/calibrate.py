@@ -13,7 +13,7 @@ from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry.adjustment import FEWEST, Adjustment, stretch
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.intrinsics import GUESSED, UNMODELLED, Found, Search
-from jaxtri.odometry.stretches import segments
+from jaxtri.odometry.stretches import keyframes, segments
 
 UNDETERMINED = 0.1  # share of the focal length: with a larger standard deviation the motion does not determine it
 
@@ -116,7 +116,10 @@ def calibrate(
         raise InputError("nothing was recorded: ask for it by record=True")
     odometry.trajectory()  # takes in what is queued, and raises where there is none
     first, end = max(segments(odometry), key=lambda s: s[1] - s[0])
-    segment, keys, settings, _ = stretch(odometry, first, end)
+    # With what seemed to move by itself: tracks disagree as much where the focal length is wrong.
+    segment, keys, settings, _ = stretch(odometry, first, end, moving=True)
+    if odometry.zoom is not None:  # it is geometric between keyframes: where it begins and ends it is not
+        keys = keyframes(replace(settings, keyframe_flow=settings.keyframe_flow / 2), segment)
     begun = Adjustment.of(settings, segment, keys)
     search = Search(odometry, (first, end), segment, keys, begun, guess or odometry.camera, prior, progress)
     none = Found(np.zeros_like(search.known), search.known, None)

@@ -39,14 +39,14 @@ class Segment(NamedTuple):
     measured: np.ndarray  # (t,) frames whose pose comes from what they show
 
     @classmethod
-    def of(cls, odometry: Odometry, first: int, end: int) -> "Segment":
-        """Of frames of a run, as it recorded them."""
+    def of(cls, odometry: Odometry, first: int, end: int, *, moving: bool = False) -> "Segment":
+        """Of frames of a run, as it recorded them; with what was taken to move by itself only where that is asked."""
         tracks: list[Slotted] = odometry.tracks[first:end]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
         poses = odometry.poses[first:end]
         cameras = (odometry.camera_at(p.time) for p in poses)
         u = np.stack([np.asarray(normalise(c, t.pixels.astype(dtype))) for c, t in zip(cameras, tracks, strict=True)])
-        seen = np.stack([t.visible & ~t.moving for t in tracks]) & np.isfinite(u).all(axis=2)
+        seen = np.stack([t.visible & (moving | ~t.moving) for t in tracks]) & np.isfinite(u).all(axis=2)
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
         times = np.array([p.time for p in poses]) / (odometry.frame_time or 1.0)
         return cls(
