@@ -56,6 +56,8 @@ class _Tracker:
     """Who proposes starts: opencv, or poselib beside it."""
     find_overlays: bool = True
     """Find bars, logos, a bonnet by themselves, and ignore them."""
+    find_dissolves: bool = True
+    """Find dissolves between shots, and start anew after them."""
     min_parallax: Annotated[
         float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 1; 0.1 with --base paper)")
     ] = None
@@ -357,13 +359,12 @@ def _how(options: Track) -> dict[str, Any]:
     from jaxtri.odometry.settings import Base, StartSettings
     from jaxtri.vision.klt import KLTSettings
 
-    base = Base(options.filter.base)
-    changes = {} if options.tracker.min_parallax is None else {"parallax_deg": options.tracker.min_parallax}
-    poselib = options.tracker.starts == "poselib"
+    base, t = Base(options.filter.base), options.tracker
+    changes = {} if t.min_parallax is None else {"parallax_deg": t.min_parallax}
     return {
         "base": base,
-        "start": StartSettings.of(base, overlap=options.filter.overlap, poselib=poselib, **changes),
-        "klt": KLTSettings(capacity=options.tracker.features, find_overlays=options.tracker.find_overlays),
+        "start": StartSettings.of(base, overlap=options.filter.overlap, poselib=t.starts == "poselib", **changes),
+        "klt": KLTSettings(t.features, find_overlays=t.find_overlays, find_dissolves=t.find_dissolves),
     }
 
 
@@ -391,9 +392,8 @@ def _demo(options: Demo) -> None:
     print(run_text(done.run, done.paths))
     print("errors against the truth, in metres:")
     print(errors_text(done.errors))
-    print(
-        f"look at {options.out / 'trajectory.png'} and {options.out / 'overlay.mp4'}; the frames are in {done.frames}"
-    )
+    shown = options.out / "trajectory.png", options.out / "overlay.mp4"
+    print(f"look at {shown[0]} and {shown[1]}; the frames are in {done.frames}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
 """A few small rendered frames: what the tests of whole runs are fed with."""
 
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from jaxtri.geometry.camera import Camera
@@ -33,3 +35,14 @@ def clip(n_frames: int = 20) -> Clip:
     images = rendered_sequence(scene, camera, poses, noise_gray=1.0)
     frames = [Frame(k, float(times[k]), image) for k, image in enumerate(images)]
     return Clip(camera, frames, Trajectory(np.asarray(times), np.asarray(poses)))
+
+
+def dissolving(length: int, n_frames: int = 20) -> Clip:
+    """Another shot, moving the other way, that comes through the first for so many frames from the sixth on."""
+    found = clip(n_frames)
+    shares = np.clip((np.arange(n_frames) - 5) / (length + 1), 0, 1)
+    mixed = []
+    for frame, other, share in zip(found.frames, found.frames[::-1], shares, strict=True):
+        image = np.ascontiguousarray(255 - other.image[::-1, ::-1])
+        mixed.append(replace(frame, image=cv2.addWeighted(frame.image, 1 - share, image, share, 0)))
+    return found._replace(frames=mixed)

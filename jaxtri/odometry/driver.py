@@ -4,33 +4,27 @@ The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, a
 """
 
 import math
-from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxlie import SE3
 
 from jaxtri.checks import ArrayOrList, booleans, image_noise, numbers, pixel_points
 from jaxtri.compilation import capacity
 from jaxtri.errors import InitialisationError, InputError
-from jaxtri.estimation.two_view import scaled
 from jaxtri.formats.archive import Archived
 from jaxtri.geometry.camera import Camera
-from jaxtri.geometry.pose import identity
 from jaxtri.geometry.zoom_curve import ZoomCurve, camera_at
+from jaxtri.odometry.beginning import Before, Begun, begin
 from jaxtri.odometry.beside import beside
-from jaxtri.odometry.followers import Follower, SinglePair, TrackPairs
-from jaxtri.odometry.poses import FramePose, pose_matrix, trajectory
+from jaxtri.odometry.followers import Follower
+from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.recorder import Recorder
 from jaxtri.odometry.replay import Recording
-from jaxtri.odometry.settings import Base, Report, Settings, StartSettings, Status
+from jaxtri.odometry.settings import Base, Settings, StartSettings, Status
 from jaxtri.odometry.slots import Slotted, slotted
-from jaxtri.odometry.start import BasePair, Observations, Start, Way, fill, find, hold, short_lived, too_slow
+from jaxtri.odometry.start import Observations, Start, Way, short_lived, too_slow
 from jaxtri.odometry.structure import Points, keep, no_points
 from jaxtri.trajectory import Trajectory
 
@@ -38,14 +32,6 @@ CATCH_UP = 2  # frames taken in for each that comes, where some came while a sta
 AGAIN = 1.1  # flow, over that of the last attempt, from which a start from the same first frame is tried again
 
 normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
-
-
-class _Begun(NamedTuple):
-    """A start: its base pair, the filter that goes on from it, and the poses of the frames that waited for it."""
-
-    pair: BasePair
-    follower: Follower
-    poses: dict[int, FramePose]
 
 
 @dataclass
@@ -98,7 +84,7 @@ class Odometry(Archived):
     _passed: list[Observations] = field(default_factory=list, init=False, repr=False)  # no longer can
     _queue: list[Observations] = field(default_factory=list, init=False, repr=False)  # are not taken in yet
     _seeking: bool = field(default=False, init=False, repr=False)  # a base pair: the first and last of those waiting
-    _search: Future[_Begun | Start] | None = field(default=None, init=False, repr=False, metadata={"saved": False})
+    _search: Future[Begun | Start] | None = field(default=None, init=False, repr=False, metadata={"saved": False})
     _follower: Follower | None = field(default=None, init=False, repr=False)
     _points: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
     _way: Way | None = field(default=None, init=False, repr=False)
@@ -165,6 +151,28 @@ class Odometry(Archived):
     def camera_at(self, time_s: float) -> Camera:
         """The camera, with the focal length that it has at a time."""
         return camera_at(self.camera, self.zoom, time_s)
+
+    def cut(self, frame: int) -> None:
+        """Another shot begins with the frame that comes next; since `frame` there was none that could be followed.
+
+        Poses from there on are taken back: `LOST`, or `INITIALISING` where no start came before. What comes next has to
+        be other tracks, and starts anew with a scale that is not known.
+        """
+        self.finish()
+        begun = self._follower.begun if self._follower is not None else []
+        if self._follower is not None:
+            self._leave(present=False)
+        if self.starts:
+            self._recorder.stop(frame - 1, begun)
+        if self.base_pair is not None and self.base_pair[0] >= frame:
+            self._recorder.pairs, self._recorder.lost = [], None
+            self.base_pair, self.starts, frame = None, 0, 0
+        if self.scale_unknown_from is not None and self.scale_unknown_from >= frame:
+            self.scale_unknown_from = None
+        status = Status.LOST if self.starts else Status.INITIALISING
+        self.poses[frame:] = [FramePose(p.time, status) for p in self.poses[frame:]]
+        self._waiting, self._passed, self._tried = [], [], (-1, 0.0)
+        self.reason = "one shot dissolves into another"
 
     def finish(self) -> None:
         """Take in the frames that came while a start was worked out, which is waited for."""
@@ -321,7 +329,7 @@ class Odometry(Archived):
         if tried != first.index or flow >= AGAIN * before:
             self._tried, self._seeking = (first.index, flow), True
 
-    def _settle(self, begun: _Begun | Start) -> None:
+    def _settle(self, begun: Begun | Start) -> None:
         """Go on from a start that was worked out beside, or without one."""
         self._search, self._seeking = None, False
         if isinstance(begun, Start):
@@ -336,63 +344,40 @@ class Odometry(Archived):
             self._recorder.pairs = [begun.pair]
             self.base_pair = begun.pair.first, begun.pair.second
         elif self.scale_unknown_from is None:
-            self.scale_unknown_from = begun.pair.first
+            self.scale_unknown_from = min(begun.poses)
         self._follower = begun.follower
         self.starts += 1
         self._waiting, self._passed = [], []
 
-    def _begin(self) -> _Begun | Start:
-        """The filter from a base pair of waiting frames, those between and before filled in; or why it has to wait.
+    def _begin(self) -> Begun | Start:
+        """A start from the frames that wait, or why there is none yet.
 
         Other frames are queued meanwhile, so it only reads, and only what they do not change.
         """
-        frames, searched = self._waiting, find(self._settings, self._start, self._waiting)
-        if searched.found is None:
-            return searched
-        pose = searched.found.pose
-        first, last = frames[0], frames[-1]
-        world = identity(pose.translation.dtype)
+        before = None
         if self.starts:
             held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
-            world = SE3.from_matrix(jnp.asarray(held, pose.translation.dtype))
-            state, _ = fill(self._settings, [first, last], pose, world, [1.0])
-            pose = scaled(pose, self._depth / float(state.depth))  # the scene as deep as it was: a guess
-        state, reports = fill(self._settings, frames, pose, world, [self._dt(f.index) for f in frames[1:]])
-        noise = float(reports[0][1].noise)
-        status = Status.RESTARTED if self.starts else Status.TRACKING
-        poses = {first.index: FramePose(first.time, status, pose_matrix(world), np.zeros((6, 6)))}
-        reports = [*reports, *self._backwards(first, state, world)]
-        poses |= {f.index: FramePose.of(f.time, report) for f, report in reports}
-        if self.base is Base.TRACKS:
-            follower: Follower = TrackPairs.after(self._settings, state, last, first.common(last))
-        else:
-            assert isinstance(self.base, Base)
-            follower = SinglePair.after(self._settings, self._start, self.base, frames, pose, world)
-        pair = BasePair(first.index, last.index, first.index, searched.found.pose, searched.found.inside, noise)
-        return _Begun(pair, follower, poses)
-
-    def _backwards(self, first: Observations, state, world: SE3) -> Iterator[tuple[Observations, Report]]:
-        """Frames that waited before the first base frame, newest first, as far as its tracks reach."""
-        mean = eqx.tree_at(
-            lambda m: (m.pose, m.twist), state.belief.mean, (world, jnp.zeros_like(state.belief.mean.twist))
-        )
-        state = state._replace(belief=eqx.tree_at(lambda b: b.mean, state.belief, mean))
-        for frame in reversed(self._passed):
-            state, report = hold(self._settings, state, frame, first.common(frame), 1.0)
-            if not Status(int(report.status)).measured:
-                return
-            yield frame, report
+            before = Before(held, self._depth)
+        assert isinstance(self.base, Base)
+        waiting, passed = self._waiting, self._passed
+        return begin(self._settings, self._start, self.base, waiting, passed, self._dt, before)
 
     def _lose(self, frame: Observations) -> None:
         """The camera is lost: start again from here."""
         assert self._follower is not None
-        self._changes += len(self._follower.begun)
         self._recorder.stop(frame.index, self._follower.begun)
         for queued in self._queue:
             self.poses[queued.index].status = Status.LOST
-        self._depth = self._follower.depth
-        for points in (self._follower.ended(), self._follower.present()):
-            keep(self._points, points)
-        self._follower = None
+        self._leave(present=True)
         self._waiting, self._tried = [frame], (-1, 0.0)
         self.reason = "too few points agreed with any motion"
+
+    def _leave(self, *, present: bool) -> None:
+        """The end of a filter: keep its points, of the tracks that have ended, and of those at `present`."""
+        assert self._follower is not None
+        self._changes += len(self._follower.begun)
+        self._depth = self._follower.depth
+        keep(self._points, self._follower.ended())
+        if present:
+            keep(self._points, self._follower.present())
+        self._follower = None

@@ -40,9 +40,11 @@ class Recorder:
             self.tracks[frame] = self.tracks[frame]._replace(moving=moving)
 
     def stop(self, frame: int, begun: list[BasePair]) -> None:
-        """The camera is lost in this frame; `begun` are the base pairs since the first."""
+        """The camera is lost in this frame, at the latest; `begun` are the base pairs since the first."""
         if self.lost is None:
             self.pairs, self.lost = [*self.pairs, *begun], frame
+        self.lost = min(self.lost, frame)
+        self.pairs = [p for p in self.pairs if p.last <= self.lost]
 
     def recording(self, begun: list[BasePair], dt: Callable[[int], float], *, inherit: bool, dtype: Any) -> Recording:
         """All of it as arrays; `begun` are base pairs that are not in `pairs` yet, `dt` that of a frame."""

@@ -110,7 +110,7 @@ def track(
     clock = _Clock()
     declared = source.declared if isinstance(source, FrameSource) else None
     bar = tqdm(total=declared, unit="frame", disable=None if progress else True, leave=False)
-    interrupted = False
+    interrupted, dissolves = False, list[tuple[int, int]]()
     try:
         # What the filter gives up of a frame the next one shows no more, and its slots are free from the one after
         # that on: the same whether the flow or the filter is faster.
@@ -119,6 +119,9 @@ def track(
         with contextlib.closing(_followed(frames, camera, features, clock, lambda: outliers)) as followed:
             for frame, tracks in followed:
                 with clock.part("filter"):
+                    if tracks.dissolved is not None:
+                        odometry.cut(tracks.dissolved)
+                        dissolves.append((tracks.dissolved, len(odometry.poses) - 1))
                     tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers))
                     _sample(colours, tracks, frame.image)
                     quality = np.stack([tracks.error, tracks.eigenvalue], axis=1)
@@ -137,7 +140,7 @@ def track(
     causal = odometry.trajectory()
     clock.end()
     statistics = _statistics(odometry, odometry.poses) | clock.statistics() | {"interrupted": interrupted}
-    statistics |= {"refined": None, "ignored": _ignored(features)}
+    statistics |= {"refined": None, "ignored": _ignored(features), "dissolves": _dissolved(dissolves)}
     points = odometry.points()
     run = Run(causal, points, _coloured(points, colours), odometry, statistics, track_colours=colours)
     return refined(run, progress=progress) if refine else run
@@ -352,6 +355,20 @@ def _ignored(features: KLT) -> dict[str, object]:
             stacklevel=3,
         )
     return {"share": share, "found": [part._asdict() for part in found]}
+
+
+def _dissolved(found: list[tuple[int, int]]) -> list[list[int]]:
+    """The first and last frames of dissolves, with a warning where there are any."""
+    if found:
+        frames = ", ".join(f"{first} to {last}" for first, last in found)
+        warnings.warn(
+            f"frames {frames} show two shots at once, as one dissolves into the other: they have no pose, and what "
+            "follows has a scale of its own; cut the clip there, or, if there is no dissolve, give "
+            "--no-find-dissolves, or KLTSettings(find_dissolves=False)",
+            InputWarning,
+            stacklevel=3,
+        )
+    return [list(span) for span in found]
 
 
 def _change(before: Trajectory, after: Trajectory) -> dict[str, float]:

@@ -11,12 +11,13 @@ from collections import deque
 
 import numpy as np
 
-from jaxtri.vision.pictures import Look
+from jaxtri.vision.pictures import Glance
 
 SPANS = 5, 9, 13, 17
 """Frames before and after a picture that it is compared with: the answer is final so many frames later."""
 
 # Found on rendered clips, dissolves between them, and copies of them with blur and dips of brightness.
+LEAST = 2  # frames in a row that are mixed: by chance one may be
 MIXED = 0.75  # `mixture` (22 rendered shots and seven sequences that are tracked have .87 and more)
 _CLOSE = 0.65  # residual of the logarithms up to which a mixture explains the contrast at all
 _MIDDLE = 0.2  # share that the weaker picture has at least: with less a mixture is hardly one
@@ -34,9 +35,9 @@ class Dissolves:
 
     def __init__(self) -> None:
         self.mixed: list[float] = []
-        self._seen: deque[Look] = deque(maxlen=2 * SPANS[-1] + 1)
+        self._seen: deque[Glance] = deque(maxlen=2 * SPANS[-1] + 1)
 
-    def add(self, now: Look) -> None:
+    def add(self, now: Glance) -> None:
         """The next picture; what it says of those before it."""
         self._seen.append(now)
         self.mixed.append(1.0)
@@ -45,17 +46,32 @@ class Dissolves:
                 found = mixture(self._seen[-1 - 2 * span], self._seen[-1 - span], now)
                 self.mixed[-1 - span] = min(self.mixed[-1 - span], found)
 
+    def beyond(self, frame: int) -> int | None:
+        """First frame of a dissolve that lasts until `frame` or longer, of the latest ones; None where there is none.
 
-def mixture(before: Look, now: Look, after: Look) -> float:
+        A dissolve is at least `LEAST` frames in a row that are mixed.
+        """
+        begun, found = max(0, len(self.mixed) - 2 * SPANS[-1] - 1), None
+        for k in range(begun, len(self.mixed)):
+            if self.mixed[k] >= MIXED:
+                begun = k + 1
+            elif k >= frame and k - begun + 1 >= LEAST:
+                found = begun
+        return found
+
+
+def mixture(before: Glance, now: Glance, after: Glance) -> float:
     """What a mixture leaves unexplained of the contrast, over what a picture between does; 1 where it is none."""
-    if now.blur > max(before.blur, after.blur) + _BLURRIER or after.recoloured(before) < _OTHERS:
+    if after.recoloured(before) < _OTHERS:
         return 1.0
     contrast, a, b = np.log(now.contrast), before.contrast, after.contrast
     mixed = _residuals(contrast, _SHARES**2 * a + (1 - _SHARES) ** 2 * b)
     between = _residuals(contrast, np.linspace(0, 1, 31)[:, None] * (a - b) + b)
-    if mixed.argmin() in (0, len(mixed) - 1) or mixed.min() > _CLOSE:
+    if mixed.argmin() in (0, len(mixed) - 1) or mixed.min() > min(_CLOSE, between.min()):
         return 1.0
-    return min(1.0, float(mixed.min() / max(between.min(), 1e-6)))
+    if now.blur > max(before.blur, after.blur) + _BLURRIER:  # last, since it takes longest to work out
+        return 1.0
+    return float(mixed.min() / max(between.min(), 1e-6))
 
 
 def _residuals(contrast: np.ndarray, models: np.ndarray) -> np.ndarray:

@@ -9,7 +9,9 @@ import numpy as np
 
 from jaxtri.errors import ResolutionChangeError
 from jaxtri.vision.bars import Bars
+from jaxtri.vision.dissolves import Dissolves
 from jaxtri.vision.overlays import Ignored, Overlays
+from jaxtri.vision.pictures import Glance
 
 STEPS, CLOSE = 30, 0.003  # optical flow ends after so many steps, or when a step is shorter than so many pixels
 BLOCK = 5  # pixels across, over which the strength of a corner is summed: a corner, and not the noise of one pixel
@@ -42,6 +44,8 @@ class KLTSettings:
             the whole view they fix the pose better than in one corner of it.
         find_overlays: Ignore bars at the edges, and what stays in its place while the picture moves. Without it a logo,
             a time code or a bonnet hold features that say that the camera stands.
+        find_dissolves: Give up all features where one shot is found to have dissolved into another, 5 to 17 frames
+            after its middle. Without it features go over from the one to the other, and with them a wrong scale.
     """
 
     capacity: int = 800
@@ -54,6 +58,7 @@ class KLTSettings:
     refill: float = 0.8
     cells: int = 8
     find_overlays: bool = True
+    find_dissolves: bool = True
 
 
 class FrameTracks(NamedTuple):
@@ -69,6 +74,8 @@ class FrameTracks(NamedTuple):
         error: (n,) forward-backward distance in pixels; NaN where it is not known, as of a fresh feature.
         eigenvalue: (n,) smaller eigenvalue of the patch's gradient matrix, per pixel
             (`cv2.OPTFLOW_LK_GET_MIN_EIGENVALS`); NaN where it is not known.
+        dissolved: Where a dissolve is found in this frame, the first frame of it: what was followed since then belongs
+            to neither shot, and all features are new. None elsewhere.
     """
 
     pixels: np.ndarray
@@ -77,6 +84,7 @@ class FrameTracks(NamedTuple):
     ids: np.ndarray
     error: np.ndarray
     eigenvalue: np.ndarray
+    dissolved: int | None = None
 
 
 @dataclass
@@ -110,6 +118,7 @@ class KLT:
         self._ignore: np.ndarray | None = None  # all of it, with its surroundings
         self._bars = Bars()
         self._overlays: Overlays | None = None
+        self._dissolves, self._shot = Dissolves(), 0  # the first frame of the present shot, so far as is known
 
     def track(self, image: np.ndarray, ignore: np.ndarray | None = None) -> FrameTracks:
         """Follow all features into `image` (h, w) or (h, w, 3) uint8, and fill the free slots.
@@ -126,6 +135,7 @@ class KLT:
                 f"frame {self._frame} is {w}x{h}, the frames before it {w0}x{h0}: split the video there"
             )
         self._shape = gray.shape
+        dissolved = self._dissolved(image, gray)
         error, eigenvalue = np.full((2, self.settings.capacity), np.nan)
         if self._previous is not None and self._alive.any():
             slots = np.flatnonzero(self._alive)
@@ -144,7 +154,7 @@ class KLT:
             fresh = self._fill(gray)
         self._previous = gray
         pixels, alive, ids = self._pixels.astype(np.float64), self._alive.copy(), self._ids.copy()
-        return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue)
+        return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue, dissolved)
 
     def drop(self, ids: np.ndarray) -> None:
         """Give up the features of these numbers: the filter found them to be outliers."""
@@ -158,6 +168,17 @@ class KLT:
     def ignored_share(self) -> float:
         """The share of the picture in which the latest frame may hold no features."""
         return 0.0 if self._ignore is None else float(self._ignore.mean())
+
+    def _dissolved(self, image: np.ndarray, gray: np.ndarray) -> int | None:
+        """Look for a dissolve; where one is found give up all features, and say which frame is its first."""
+        if not self.settings.find_dissolves or image.ndim == 2:
+            return None
+        self._dissolves.add(Glance.of(image, gray))
+        first = self._dissolves.beyond(self._shot)
+        if first is not None:
+            self._alive[:] = False
+            first, self._shot = max(first, self._shot), self._frame
+        return first
 
     def _find(self, gray: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
         """What is found to be ignored (h, w): bars and overlays."""

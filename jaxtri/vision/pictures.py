@@ -1,6 +1,7 @@
 """Figures of single pictures: exposure, blur, combing, and how two pictures differ."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -13,64 +14,77 @@ ENDS = 2  # grey levels from either end that count as clipped: coding moves them
 SMOOTH, REBLUR = 0.8, 9  # pixels: against noise; and the blur that a blurred picture hardly notices
 STRONG = 0.95  # share of the pixels that have weaker edges than those by which blur is told
 STANDS_OUT = 8  # grey levels by which a row must differ from both beside it
-COARSE, FINE, PARTS, SPREAD = (
-    160,
-    (1.0, 4.0),
-    (8, 6),
-    8.0,
-)  # pixels across, band, parts, blur between parts: of contrast
+COARSE, FINE, PARTS, SPREAD = 160, (1.0, 4.0), (8, 6), 8.0  # of contrast: pixels across, band, parts, their blur
 
 
 @dataclass(frozen=True)
-class Look:
+class Glance:
+    """What tells one shot from another: little of a picture, and soon worked out.
+
+    Attributes:
+        grey: The picture in grey, at most `WIDE` pixels across.
+        colours: Histogram of the thumbnail, its mean brought to the middle of the scale; sums to 1.
+        contrast: Mean square of the fine structure in each part, over that of the brightness; never zero.
+    """
+
+    grey: UInt8[np.ndarray, "h w"]
+    colours: Float[np.ndarray, " bins"]
+    contrast: Float[np.ndarray, " parts"]
+
+    @classmethod
+    def of(cls, image: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"]) -> "Glance":
+        """Of a BGR picture, and the same in grey."""
+        small = _small(grey)
+        return cls(small, _colours(image), _contrast(small))
+
+    @cached_property
+    def blur(self) -> float:
+        """0 (sharp) to 1 (blurred in at least one direction)."""
+        return _blur(self.grey)
+
+    def recoloured(self, before: "Glance") -> float:
+        """The share whose colours are others."""
+        return float(1 - np.minimum(self.colours, before.colours).sum())
+
+
+@dataclass(frozen=True)
+class Look(Glance):
     """Figures of one picture; see `jaxtri.vision.survey.Survey`.
 
     Attributes:
         brightness: Mean grey level, 0 to 1.
         black: Share of the pixels at the lower end of the scale.
         white: Share of the pixels at its upper end.
-        blur: 0 (sharp) to 1 (blurred in at least one direction).
         combing: Share of the pixels that differ from both rows beside them, less three times the columns' share.
-        grey: The picture in grey, at most `WIDE` pixels across.
-        colours: Histogram of the thumbnail, its mean brought to the middle of the scale; sums to 1.
-        contrast: Mean square of the fine structure in each part, over that of the brightness; never zero.
     """
 
     brightness: float
     black: float
     white: float
-    blur: float
     combing: float
-    grey: UInt8[np.ndarray, "h w"]
-    colours: Float[np.ndarray, " bins"]
-    contrast: Float[np.ndarray, " parts"]
 
     def against(self, before: "Look") -> tuple[float, float]:
         """Mean absolute difference in grey levels, and the share whose colours are others."""
         return float(cv2.absdiff(self.grey, before.grey).mean()), self.recoloured(before)
 
-    def recoloured(self, before: "Look") -> float:
-        """The share whose colours are others."""
-        return float(1 - np.minimum(self.colours, before.colours).sum())
-
 
 def look(image: UInt8[np.ndarray, "h w 3"]) -> Look:
     """The figures of a BGR picture."""
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    scale = WIDE / max(grey.shape)
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
-    step = max(1, round(1 / scale))
+    step = max(1, round(max(grey.shape) / WIDE))
     levels = np.bincount(grey[::step, ::step].ravel(), minlength=256) / grey[::step, ::step].size
     return Look(
+        **vars(Glance.of(image, grey)),
         brightness=float(levels @ np.arange(256)) / 255,
         black=float(levels[: ENDS + 1].sum()),
         white=float(levels[-ENDS - 1 :].sum()),
-        blur=_blur(small),
         combing=_combing(_middle(grey)),
-        grey=small,
-        colours=_colours(image),
-        contrast=_contrast(small),
     )
+
+
+def _small(grey: np.ndarray) -> np.ndarray:
+    scale = WIDE / max(grey.shape)
+    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
 
 
 def _middle(grey: np.ndarray) -> np.ndarray:

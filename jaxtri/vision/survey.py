@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
 from jaxtri.errors import InputError
-from jaxtri.vision.dissolves import MIXED, Dissolves
+from jaxtri.vision.dissolves import LEAST, MIXED, Dissolves
 from jaxtri.vision.hypotheses import FARTHER, SHARES
-from jaxtri.vision.klt import KLT, FrameTracks
+from jaxtri.vision.klt import KLT, FrameTracks, KLTSettings
 from jaxtri.vision.pictures import Look, look
 from jaxtri.vision.video import Frame, FrameSource, ahead
 
@@ -140,7 +140,7 @@ class Survey:
     @property
     def dissolves(self) -> Bool[np.ndarray, " t"]:
         """Middle frames of what seem to be dissolves from one shot to another."""
-        return _runs(self.mixed < MIXED, 2)
+        return _runs(self.mixed < MIXED, LEAST)
 
     @property
     def jumps(self) -> Bool[np.ndarray, " t"]:
@@ -209,7 +209,7 @@ class _Features:
     """Follows features, and sees how far they come."""
 
     def __init__(self) -> None:
-        self._klt = KLT()
+        self._klt = KLT(KLTSettings(find_dissolves=False))  # they are looked for anyway
         self._ages = np.zeros(self._klt.settings.capacity, int)
         self._lives: list[int] = []  # counts of the features that were followed for 0, 1, 2, ... frames
         self._last: FrameTracks | None = None

@@ -7,6 +7,7 @@ from tracks import CAPACITY, make, sideways
 
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.refine import refine
 from jaxtri.odometry.run import follow_tracks
 from jaxtri.odometry.settings import Base, Settings, StartSettings, Status
 from jaxtri.odometry.start import Start, step_tracks
@@ -156,6 +157,58 @@ def test_a_complete_loss_starts_anew_and_says_that_the_scale_is_unknown():
     assert np.isfinite(odometry.trajectory().T_world_camera).all()
 
 
+def fed(odometry, pixels, visible, begin=0):
+    """The odometry, once it has taken the tracks of a shot, with numbers of their own, in frames from `begin` on."""
+    for k in range(len(pixels)):
+        odometry.add(pixels[k], visible[k], float(begin + k), ids=begin * CAPACITY + np.arange(CAPACITY))
+    odometry.finish()
+    return odometry
+
+
+def test_a_cut_takes_back_what_lies_between_two_shots_and_each_is_as_it_is_alone():
+    first, second = sideways(30), sideways(45, seed=5)
+    mixed = first.pixels.copy()
+    mixed[20:] += np.linspace(0, 30, 10)[:, None, None]  # what has come of the tracks meanwhile
+    one = fed(Odometry(first.camera, record=True), mixed[:20], first.visible[:20])
+    other = fed(Odometry(first.camera), second.pixels, second.visible)
+    odometry = fed(Odometry(first.camera, record=True), mixed, first.visible)
+    assert odometry.status is Status.TRACKING
+    odometry.cut(20)
+    fed(odometry, second.pixels, second.visible, 30)
+    status = [p.status for p in odometry.poses]
+    assert status[20:30] == [Status.LOST] * 10
+    assert status[30] is Status.RESTARTED
+    assert set(status[:20] + status[31:]) == {Status.TRACKING}
+    assert (odometry.base_pair, odometry.scale_unknown_from) == (one.base_pair, 30)
+    np.testing.assert_array_equal(
+        [p.T_camera_world for p in odometry.poses[:20]], [p.T_camera_world for p in one.poses]
+    )
+    jax.tree.map(np.testing.assert_array_equal, odometry.recording(), one.recording())
+    # The second shot in its own world, and in the units that it has when it comes first.
+    T = np.stack([p.T_camera_world for p in odometry.poses[30:]])
+    T = T @ np.linalg.inv(T[0])
+    alone = np.stack([p.T_camera_world for p in other.poses])
+    T[:, :3, 3] *= np.linalg.norm(alone[-1, :3, 3]) / np.linalg.norm(T[-1, :3, 3])
+    np.testing.assert_allclose(T, alone, atol=1e-3)  # in base lines; what is assumed of the gauge is no ratio
+    assert [part["frames"] for part in refine(odometry).statistics["parts"]] == [[0, 19], [30, 74]]
+
+
+def test_a_cut_takes_back_a_start_that_came_after_it():
+    first, second = sideways(30), sideways(45, seed=5)
+    odometry = fed(Odometry(first.camera, record=True), first.pixels, first.visible)
+    odometry.cut(0)
+    assert {p.status for p in odometry.poses} == {Status.INITIALISING}
+    assert (odometry.base_pair, odometry.starts, odometry.scale_unknown_from) == (None, 0, None)
+    with pytest.raises(InitialisationError, match="dissolves into another"):
+        odometry.trajectory()
+    fed(odometry, second.pixels, second.visible, 30)
+    alone = fed(Odometry(first.camera), second.pixels, second.visible, 30)
+    found, right = ([p.T_camera_world for p in poses] for poses in (odometry.poses[30:], alone.poses))
+    np.testing.assert_array_equal(found, right)
+    assert (odometry.starts, odometry.scale_unknown_from) == (1, None)
+    assert len(odometry.recording().pixels) == 45
+
+
 def test_frames_that_come_while_a_start_is_worked_out_change_nothing():
     at_once = covered(lag=0)
     for lag in (5, 100):
@@ -170,7 +223,7 @@ def test_an_error_while_a_start_is_worked_out_is_raised(monkeypatch):
     def fail(*_):
         raise MemoryError("no room")
 
-    monkeypatch.setattr("jaxtri.odometry.driver.find", fail)
+    monkeypatch.setattr("jaxtri.odometry.beginning.find", fail)
     tracks = sideways(20)
     with pytest.raises(MemoryError, match="no room"):
         follow_tracks(tracks.camera, tracks.pixels, tracks.visible)
@@ -184,7 +237,7 @@ def test_a_start_is_worked_out_as_its_caller_has_set_jax(monkeypatch):
         seen.append((jax.enable_x64.value, jax.default_device.value))
         return Start(None, "not now")
 
-    monkeypatch.setattr("jaxtri.odometry.driver.find", find)
+    monkeypatch.setattr("jaxtri.odometry.beginning.find", find)
     tracks, device = sideways(20), jax.devices("cpu")[0]
     with jax.enable_x64(False), jax.default_device(device):
         follow_tracks(tracks.camera, tracks.pixels, tracks.visible)

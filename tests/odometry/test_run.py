@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from footage import clip
+from footage import clip, dissolving
 
 from jaxtri.errors import CameraError, InputWarning
 from jaxtri.geometry.camera import Camera
@@ -81,6 +81,23 @@ def test_what_is_ignored_of_the_picture_is_said_and_warned_of():
     assert "% of the picture ignored: bar at x 0 to 319, y 0 to 39, frame 0 to the end; bar at" in text
     plain = KLTSettings(capacity=128, find_overlays=False)
     assert track(barred, camera, klt=plain, progress=False).statistics["ignored"] == {"share": 0.0, "found": []}
+
+
+def test_a_dissolve_is_taken_back_and_said():
+    """The causal poses and the refined ones have none where two shots are one picture, and no track goes over."""
+    camera, frames, _ = dissolving(8, 24)
+    start = StartSettings(lag=0, flow=0.01)  # what comes before it is short
+    with pytest.warns(InputWarning, match=r"frames \d+ to 1\d show two shots at once.*--no-find-dissolves"):
+        run = track(frames, camera, klt=KLT_SETTINGS, start=start, refine=True, progress=False)
+    (span,) = run.statistics["dissolves"]  # pyright: ignore[reportGeneralTypeIssues]
+    first, last = span
+    assert 5 < first < 10
+    assert 13 < last < 22
+    for poses in (run.odometry.poses, run.poses):
+        assert {p.status for p in poses[first : last + 1]} <= {Status.LOST, Status.INITIALISING}
+        assert {p.T_camera_world is None for p in poses[first : last + 1]} == {True}
+    klt = KLTSettings(capacity=128, find_dissolves=False)
+    assert track(frames, camera, klt=klt, start=start, progress=False).statistics["dissolves"] == []
 
 
 def test_the_outcome_is_the_same_whichever_thread_is_slower(monkeypatch):

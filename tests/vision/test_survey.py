@@ -5,14 +5,14 @@ import json
 import cv2
 import numpy as np
 import pytest
-from footage import clip
+from footage import clip, dissolving
 
 from jaxtri.cli import main
 from jaxtri.errors import InputError
 from jaxtri.odometry.settings import StartSettings
 from jaxtri.output.check import check_text, findings, verdict
 from jaxtri.vision.dissolves import MIXED, mixture
-from jaxtri.vision.klt import KLT
+from jaxtri.vision.klt import KLT, KLTSettings
 from jaxtri.vision.pictures import look
 from jaxtri.vision.survey import COMMON, FLOW, POINTS, survey
 from jaxtri.vision.video import Frame
@@ -65,13 +65,6 @@ def test_a_clean_clip_has_no_fault():
     assert found.startable
     start = StartSettings()
     assert (start.points, start.common, start.flow) == (POINTS, COMMON, FLOW)
-
-
-def dissolving(length):
-    """Another shot, moving the other way, that comes through the first for so many frames from the sixth on."""
-    first, second = images(), [np.ascontiguousarray(255 - image[::-1, ::-1]) for image in images()[::-1]]
-    shares = np.clip((np.arange(N) - 5) / (length + 1), 0, 1)
-    return [cv2.addWeighted(a, 1 - s, b, s, 0) for a, b, s in zip(first, second, shares, strict=True)]
 
 
 FAULTS = {
@@ -178,7 +171,7 @@ def test_the_command_line_says_it_and_writes_it(tmp_path, capsys):
 
 @pytest.mark.parametrize("length", [6, 10])
 def test_a_dissolve_is_seen_where_it_is_and_a_haze_or_a_blur_is_none(length):
-    found = surveyed(dissolving(length))
+    found = surveyed(f.image for f in dissolving(length).frames)
     at = np.flatnonzero(found.dissolves)
     assert len(at) >= length // 3
     assert at.min() > 5
@@ -187,6 +180,20 @@ def test_a_dissolve_is_seen_where_it_is_and_a_haze_or_a_blur_is_none(length):
     assert 3 <= int(finding.remedy.split("--max-frames ")[1].split()[0]) <= at.min()
     for change in (lambda image: cv2.addWeighted(image, 0.5, np.full_like(image, 140), 0.5, 0), smeared):
         assert not surveyed(changed(range(7, 7 + length), change)).dissolves.any()
+
+
+def test_the_tracker_gives_up_its_features_once_where_a_dissolve_is_found():
+    for find in (True, False):
+        klt = KLT(KLTSettings(capacity=128, find_dissolves=find))
+        tracks = [klt.track(frame.image) for frame in dissolving(10).frames]
+        found = [k for k, t in enumerate(tracks) if t.dissolved is not None]
+        assert len(found) == find
+        for k in found:
+            assert 5 < tracks[k].dissolved < k  # pyright: ignore[reportOptionalOperand]
+            assert tracks[k].ids[tracks[k].visible].min() > tracks[k - 1].ids.max()
+    pictures = [frame.image[..., 0] for frame in dissolving(10).frames]  # in grey there are no colours to tell shots by
+    klt = KLT()
+    assert [klt.track(image).dissolved for image in pictures] == [None] * N
 
 
 def textured(seed):
