@@ -19,8 +19,8 @@ PRINTED = {
     "calibration_gradient": [
         (r"by focal: (\S+), by", 0.02, 0.04),
         (r"by focal: .* differences (\S+)", 0.02, 0.04),
-        (r"by k1: (\S+), by", -0.4, -0.2),
-        (r"by k1: .* differences (\S+)", -0.4, -0.2),
+        (r"by k1: (\S+), by", -0.2, -0.1),
+        (r"by k1: .* differences (\S+)", -0.2, -0.1),
     ],
     "live": [(r"tracking at .* one sigma (\S+)\n", 0.01, 0.3), (r"(\S+) base lines in 30 frames", 2, 3.5)],
     "own_tracks": [
@@ -33,7 +33,7 @@ PRINTED = {
     "range_bearing": [
         (r"(\S+) off, rms", 0.005, 0.05),
         (r"noises \[ *(\S+) ", -0.1, 0.1),
-        (r"noises \[ *\S+ +(\S+)\]", -0.1, 0.1),
+        (r"noises \[ *\S+ +([^\s\]]+) *\]", -0.1, 0.1),
     ],
     "save_load": [(r"(\S+) poses, tracking; the same as without a stop: True", 30, 30), (r"frame (\S+):", 15, 15)],
     "tune": [(r"(\S+) px told", 1, 1), (r"(\S+) px found", 0.09, 0.11)],
