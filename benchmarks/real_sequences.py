@@ -16,8 +16,8 @@ step, 1.79 degrees after the circle. All but these two rows were measured before
 `refine` in the window and the filter gave 0.19 0.60 1.78 1.05 0.64 0.76, 0.685, and a rotation error a frame 6 %
 smaller. Refined to the last decimal it is 0.518; with three steps 0.535; with the noise that was found in the place of
 the one assumed, found again after it, 0.556.
-Without a calibration (--uncalibrated, from 60 degrees): focal length off by +.06 -.20 -.46 -3.1 +1.9 +1.2 %, stated
-1.5 1.6 1.5 1.6 1.5 1.6 %; ATE .010 .332 .162 .690 .063 .075 %, refined .005 .308 .171 .576 .053 .067 %.
+Without a calibration (--uncalibrated, from 60 degrees): focal length off by +.05 -.04 -.52 -.41 +1.7 +2.0 %, stated
+1.5 1.7 1.5 1.5 1.5 1.6 %; ATE .010 .331 .168 .679 .065 .074 %, refined .005 .273 .189 .590 .041 .061 %.
 """
 
 import warnings

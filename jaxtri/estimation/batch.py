@@ -10,7 +10,7 @@ Source: Triggs et al. 2000, sections 6 and 7.
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,9 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri.estimation.bundle import (
+    Linearised,
     Points,
+    Reduced,
     calibration_pull,
     held,
     points_given,
@@ -276,6 +278,18 @@ def normal_equations(
     batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], damping: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Tridiagonal]:
     """The cost, and what all chunks say of the poses, in the blocks of the last layer, with the gauge held."""
+    return assembled(batch, noise, poses, points, damping, lambda *_: ())[:2]
+
+
+def assembled(
+    batch: Batch,
+    noise: Noise,
+    poses: SE3,
+    points: tuple[Points, ...],
+    damping: Float[Array, ""],
+    more: Callable[[Chunk, Linearised, Reduced], Any],
+) -> tuple[Float[Array, ""], Tridiagonal, list]:
+    """`normal_equations`, and `more` of what each chunk says, layer by layer; zeros behind the last chunk."""
     size, dtype = batch.layers[-1].size, noise.sigma.dtype
     m, s = len(batch.present) // size, 6 * size
     # Of each block what it has with itself, the upper half, and with the next.
@@ -286,27 +300,35 @@ def normal_equations(
         old = jax.lax.dynamic_slice(rows, at, (1, *more.shape))
         return jax.lax.dynamic_update_slice(rows, old + more, at)
 
+    each = []
     for layer, of_layer in zip(batch.layers, points, strict=True):
 
-        def add(index: Array, total: tuple, layer: Layer = layer, of_layer: Points = of_layer) -> tuple:
+        def linear(index: Array | int, layer: Layer = layer, of_layer: Points = of_layer) -> tuple[Array, tuple]:
             chunk, points = layer.chunk(index), jax.tree.map(lambda x: x[index], of_layer)
             said = chunk.said(noise, poses, points)
-            reduced = reduce(said, points, chunk.prior, damping=damping)
-            before, rows, pull = total
+            return said.cost + chunk.owed(points), (chunk, said, reduce(said, points, chunk.prior, damping=damping))
+
+        def add(index: Array, found: tuple, layer: Layer = layer, linear: Callable = linear) -> tuple:
+            cost, (chunk, said, reduced) = linear(index)
+            (before, rows, pull), others = found
+            others = jax.tree.map(lambda x, y: x.at[index].set(y), others, more(chunk, said, reduced))
             b, half = layer.size, 6 * layer.size
             rows = plus(rows, reduced.information[:half], chunk.begin)
             rows = plus(rows, reduced.information[half:, half:], chunk.begin + b)
             at = 6 * chunk.begin
             there = jax.lax.dynamic_slice_in_dim(pull, at, 2 * half)
             pull = jax.lax.dynamic_update_slice_in_dim(pull, there + reduced.pull, at, 0)
-            return before + said.cost + chunk.owed(points), rows, pull
+            return (before + cost, rows, pull), others
 
-        total = jax.lax.fori_loop(0, layer.chunks, add, total)
+        shapes = jax.eval_shape(lambda index, linear=linear: more(*linear(index)[1]), 0)
+        empty = jax.tree.map(lambda x, layer=layer: jnp.zeros((len(layer.mask), *x.shape), x.dtype), shapes)
+        total, found = jax.lax.fori_loop(0, layer.chunks, add, (total, empty))
+        each.append(found)
     before, rows, pull = total
     own, above = jnp.triu(rows[:, :, :s]), rows[:-1, :, s:]
     free = free_errors(batch, poses).reshape(m, size, 6, 6)
     diagonal, pull = jax.vmap(held)(free, own + jnp.triu(own, 1).swapaxes(1, 2), pull.reshape(m, s))
-    return before, Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], above, free[1:]), pull)
+    return before, Tridiagonal(diagonal, jax.vmap(projected)(free[:-1], above, free[1:]), pull), each
 
 
 def moved_poses(batch: Batch, poses: SE3, x: Float[Array, "k 6"]) -> SE3:

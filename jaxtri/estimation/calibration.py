@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
-from jaxtri.estimation.batch import free_errors, normal_equations
-from jaxtri.estimation.bundle import Points, reduce
+from jaxtri.estimation.batch import assembled, free_errors
+from jaxtri.estimation.bundle import Linearised, Points, Reduced
 from jaxtri.estimation.layers import Batch, Chunk, Noise
 from jaxtri.estimation.precision import Precision
 from jaxtri.estimation.tridiagonal import Factors
@@ -124,9 +124,7 @@ def told(
     share = jnp.zeros((len(batch.present), 0), noise.sigma.dtype) if knots is None else knots
     p = unknown(camera) + share.shape[1]
 
-    def one(chunk: Chunk, points: Points) -> _Part:
-        said = chunk.said(noise, poses, points)
-        reduced = reduce(said, points, chunk.prior)
+    def one(chunk: Chunk, said: Linearised, reduced: Reduced) -> _Part:
         v, n = said.weights.shape
         u = jnp.moveaxis(chunk.observed, 0, -1) - noise.sigma * jnp.moveaxis(said.residual, 1, -1)
         # An outlier may be estimated far outside of the picture, where a lens has no slope; it hardly weighs.
@@ -148,9 +146,8 @@ def told(
             (of_poses - jnp.einsum("etn,tn->en", reduced.cross, reduced.offset)).reshape(v, 6, n),
         )
 
-    parts = batch.mapped(one, points)
     none = jnp.zeros((), noise.sigma.dtype)
-    _, equations = normal_equations(batch, noise, poses, points, none)
+    _, equations, parts = assembled(batch, noise, poses, points, none, one)
     cross = jnp.zeros((len(batch.present), 6, p), noise.sigma.dtype)
     frames = [layer.begin[:, None] + jnp.arange(2 * layer.size) for layer in batch.layers]
     for part, at in zip(parts, frames, strict=True):

@@ -71,16 +71,17 @@ class Calibration:
         return said
 
     def shift(self, other: Camera, zoom: ZoomCurve | None = None) -> float:
-        """How far another camera sees what this one sees at the corner of its picture, as a share of the way there.
+        """How far another camera sees what this one sees at the edge of its picture, as a share of the way there.
 
         By its focal length, where they zoom at the worst time, and its lens: a principal point that moves is, nearly, a
-        camera that turns.
+        camera that turns. At the middle of the right edge: for a corner a lens with much distortion has no ray.
         """
         c = self.camera
-        corner = jnp.asarray([c.width or 2 * c.cx, c.height or 2 * c.cy], c.fx.dtype)
-        ray, centre = c.to_normalised(corner), jnp.stack([c.cx, c.cy])
-        seen = replace(other, cx=c.cx, cy=c.cy).to_pixels(ray)
-        moved = jnp.linalg.norm(seen - corner) / jnp.linalg.norm(corner - centre)
+        edge, centre = jnp.stack([jnp.asarray(c.width or 2 * c.cx, c.fx.dtype), c.cy]), jnp.stack([c.cx, c.cy])
+        ray = c.to_normalised(edge)
+        # By the ray, and not the edge: where there is none for that either, there is one that is near.
+        here, there = c.to_pixels(ray), replace(other, cx=c.cx, cy=c.cy).to_pixels(ray)
+        moved = jnp.linalg.norm(there - here) / jnp.linalg.norm(edge - centre)
         return max(float(moved), abs(math.log(float(other.fx / c.fx)))) + _apart(self.zoom, zoom)
 
 

@@ -16,15 +16,17 @@ from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry.adjustment import Adjustment
 from jaxtri.odometry.driver import Odometry, normalise
-from jaxtri.odometry.stretches import Pieces, Segment
+from jaxtri.odometry.stretches import Segment
 
 # What is known beforehand: of the focal length, as a share of it, where it is a guess of what most cameras have (24 to
 # 110 degrees are within one standard deviation of 60); of the principal point, as a share of the width; of k1 and k2.
 GUESSED, CENTRE, LENS = 0.5, 0.02, (0.2, 0.1)
-ALONE, TOGETHER = 8, 20  # changes at most: of the focal length alone, and with those of all that is free
-STEPS, FIRST = 4, 20  # of the poses and points after each change, and before the first
+# Changes at most: of the focal length alone; of that and a zoom; and of all that is free.
+FOCAL, ALONE, TOGETHER = 3, 8, 12
+STEPS, FIRST = 4, 20  # of the poses and points after each change, and before the first, at most
+ENOUGH = 0.01  # share of the cost: a step that takes less away is the last one
 LARGEST = (0.25, 0.02, 0.02, 0.1, 0.05)  # change of each at once: so far is the slope still good
-SETTLED = 0.1  # standard deviations, below which a change is none
+SETTLED = 0.1  # standard deviations, with UNMODELLED, below which a change is the last one
 TIMES, CELLS = 10, 3  # parts of the sequence, and of each side of the picture, that may err each in its own way
 # A focal length that changes is known at so many keyframes at most beside the first. Its logarithm walks: twice as long
 # in four seconds of 25 frames is two standard deviations. A change at once is a tenth at most.
@@ -89,11 +91,11 @@ class Search:
         with tqdm(unit="step", desc="calibrate", disable=None if self.progress else True, leave=False) as bar:
 
             def without() -> Found:
-                told = self._descend(intrinsics, TOGETHER - ALONE, bar)
+                told = self._descend(intrinsics, TOGETHER, bar)
                 return Found(self._x[: self._p].copy(), self._sd(told, intrinsics)[: self._p], None)
 
             # The focal length first: far from it a lens is found that explains what is wrong with it, and stays.
-            self._descend(focal, ALONE, bar)
+            self._descend(focal, FOCAL, bar)
             found, cost = None, math.inf  # a zoom that is followed already need not be shown again
             if self.odometry.zoom is None:
                 begun = self._now, self._adjusted, self._x.copy()
@@ -103,7 +105,7 @@ class Search:
                 # From before the other intrinsics have explained it.
                 self._now, self._adjusted, self._x = begun
             self._descend(focal | knots, ALONE, bar)
-            found = self._zoom(self._descend(place >= 0, TOGETHER - ALONE, bar), cost) or found
+            found = self._zoom(self._descend(place >= 0, TOGETHER, bar), cost) or found
             if found is not None:
                 return found
             self._x[0], self._x[knots], self._adjusted = self._x[0] + self._mean(), 0.0, False
@@ -163,14 +165,18 @@ class Search:
             free, number = free[: len(pull)], number + 1
             step = np.zeros_like(pull)
             step[free] = np.linalg.solve(information[np.ix_(free, free)], pull[free])
-            sd = np.sqrt(np.maximum(np.diag(np.linalg.inv(information)), 0))
-            if not np.isfinite(step).all() or (np.abs(step) < SETTLED * sd).all() or number == most:
+            if not np.isfinite(step).all():
                 return told
+            sd = np.sqrt(np.maximum(np.diag(np.linalg.inv(information)), 0))
+            settled = (np.abs(step) < SETTLED * np.hypot(sd, UNMODELLED)).all()
             step = np.clip(step, -largest[: len(step)], largest[: len(step)])
             self._x[: len(step)] += step
             moved = batch.moved_poses(problem, self._now.poses, told.response @ jnp.asarray(step))
-            self._now, self._adjusted = Estimate.of(moved, self._now.points), False
+            cost, self._adjusted = self._now.cost, False
+            self._now = Estimate.of(moved, self._now.points)._replace(cost=cost)  # a little more than it is now
             bar.update()
+            if settled or number == most:
+                return told
 
     def _told(self, knots: bool) -> tuple[batch.Batch, Told, np.ndarray, np.ndarray]:
         """All that was seen as the camera would see it, and what it tells, with what was known beforehand."""
@@ -182,8 +188,8 @@ class Search:
         if not self._adjusted:
             self._now = Estimate.of(self._now.poses, self._now.points)
             for _ in range(self._steps):
-                self._now = batch.step(problem, noise, self._now)
-                if bool(self._now.done):
+                before, self._now = float(self._now.cost), batch.step(problem, noise, self._now)
+                if bool(self._now.done) or before - float(self._now.cost) < ENOUGH * before < math.inf:
                     break
             self._adjusted, self._steps = True, STEPS
         size, share = len(self._x) if knots else self._p, None
@@ -224,13 +230,15 @@ class Search:
         """All that was seen, as the camera and its zoom see it; what they have no ray for is left out."""
         zoom, none = np.exp(np.r_[0.0, self._x[self._p :]]), np.zeros(len(self._at))
         curve = ZoomCurve(self._times, zoom, none)
-        u, dtype, layers = self.segment.u.copy(), self.segment.u.dtype, []
-        for key, frame in zip(self.keys, self.frames[0] + self.keys, strict=True):
+        dtype, layers = self.segment.u.dtype, []
+        u = np.zeros((len(self.keys), *self.segment.u.shape[1:]), dtype)
+        for k, frame in enumerate(self.frames[0] + self.keys):
             seen_by = curve.camera(camera, self.odometry.poses[frame].time)
-            z = np.asarray(normalise(seen_by, self.odometry.tracks[frame].pixels.astype(dtype)))
-            u[key] = np.where(self.segment.seen[key][:, None], z, 0.0)
-        pieces = Pieces.of(self.segment._replace(u=u), self.keys)
-        for layer, (observed, mask, *_) in zip(self.begun.problem.layers, pieces.layers, strict=True):
+            u[k] = np.asarray(normalise(seen_by, self.odometry.tracks[frame].pixels.astype(dtype)))
+        pieces = self.begun.pieces
+        for layer, observed, (_, mask, *_) in zip(
+            self.begun.problem.layers, pieces.observed(u), pieces.layers, strict=True
+        ):
             mask = mask & np.isfinite(observed).all(axis=1)
             layers.append(layer._replace(observed=jnp.asarray(np.nan_to_num(observed)), mask=jnp.asarray(mask)))
         return self.begun.problem._replace(layers=tuple(layers))

@@ -131,11 +131,21 @@ class Pieces(NamedTuple):
             observed, mask = np.zeros((c, 2, 2 * b, n), segment.u.dtype), np.zeros((c, 2 * b, n), bool)
             look = layer[piece] == number
             at = chunk[piece[look]]
-            where = at, key[look] - starts[at], column[piece[look]]
-            observed[where[0], :, where[1], where[2]] = segment.u[keys[key[look]], slot[look]]
-            mask[where] = True
+            mask[at, key[look] - starts[at], column[piece[look]]] = True
             layers.append((observed, mask, starts, np.asarray(count, np.int32)))
-        return cls(layers, ids[first], layer, chunk, column, key, slot, piece)
+        found = cls(layers, ids[first], layer, chunk, column, key, slot, piece)
+        filled = zip(found.observed(segment.u[keys]), layers, strict=True)
+        return found._replace(layers=[(observed, *rest) for observed, (_, *rest) in filled])
+
+    def observed(self, u: np.ndarray) -> list[np.ndarray]:
+        """The first entry of each of the `layers`, of other points (k, n, 2) of the keyframes."""
+        found = [np.zeros_like(layer[0]) for layer in self.layers]
+        for number, (observed, (_, _, begin, _)) in enumerate(zip(found, self.layers, strict=True)):
+            here = self.layer[self.piece] == number
+            piece, key = self.piece[here], self.key[here]
+            chunk = self.chunk[piece]
+            observed[chunk, :, key - begin[chunk], self.column[piece]] = u[key, self.slot[here]]
+        return found
 
     def each(self, of_layers: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
         """Of each piece, (p, *shape), what stands in arrays (c, *shape, n)."""

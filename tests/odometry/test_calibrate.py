@@ -62,11 +62,13 @@ def test_exact_tracks_give_the_camera_back(share):
     assert found.determined
     assert found.zoom is None
     assert found.statistics()["focal_length_px"] == round(float(found.camera.fx), 3)
-    # How far a camera sees what another one does at its corner: none, and a zoom by it.
+    # How far a camera sees what another one does at the edge: none, and a zoom by it.
     assert found.shift(found.camera) < 1e-9
     wider = replace(found.camera, fx=found.camera.fx * 1.02, fy=found.camera.fy * 1.02)
     assert found.shift(wider) == pytest.approx(0.02, rel=0.05)
     assert found.shift(replace(wider, cx=wider.cx + 9)) == found.shift(wider)
+    fish = replace(wider, distortion=BrownConrady.from_coefficients([-0.9]))  # has no ray for the edge
+    assert replace(found, camera=fish).shift(fish) == 0
 
 
 def test_a_zoom_on_the_way_is_found_and_followed():
