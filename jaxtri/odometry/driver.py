@@ -155,9 +155,12 @@ class Odometry(Archived):
     def cut(self, frame: int) -> None:
         """Another shot begins with the frame that comes next; since `frame` there was none that could be followed.
 
-        Poses from there on are taken back: `LOST`, or `INITIALISING` where no start came before. What comes next has to
-        be other tracks, and starts anew with a scale that is not known.
+        Poses from there on are taken back: `LOST`, or `INITIALISING` where no start came before. What comes next starts
+        anew with a scale that is not known. `KLT` says when: `FrameTracks.dissolved`. Raises `InputError` where there
+        is no such frame yet.
         """
+        if not 0 <= frame <= len(self.poses):
+            raise InputError(f"cut: frame {frame} of {len(self.poses)}; give one of those so far, or the next")
         self.finish()
         begun = self._follower.begun if self._follower is not None else []
         if self._follower is not None:

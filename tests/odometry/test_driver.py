@@ -196,6 +196,9 @@ def test_a_cut_takes_back_what_lies_between_two_shots_and_each_is_as_it_is_alone
 def test_a_cut_takes_back_a_start_that_came_after_it():
     first, second = sideways(30), sideways(45, seed=5)
     odometry = fed(Odometry(first.camera, record=True), first.pixels, first.visible)
+    for frame in (-1, 31):
+        with pytest.raises(InputError, match=f"frame {frame} of 30"):
+            odometry.cut(frame)
     odometry.cut(0)
     assert {p.status for p in odometry.poses} == {Status.INITIALISING}
     assert (odometry.base_pair, odometry.starts, odometry.scale_unknown_from) == (None, 0, None)
