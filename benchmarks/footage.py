@@ -32,15 +32,14 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from contract import parser, report, table
-from jaxlie import SE3
 
 jax.config.update("jax_enable_x64", True)
 
 import footage_scenes as scenes  # noqa: E402
+from honesty import nees  # noqa: E402
 
 from jaxtri.errors import InitialisationError  # noqa: E402
 from jaxtri.formats import atomic_path  # noqa: E402
-from jaxtri.geometry.pose import local  # noqa: E402
 from jaxtri.odometry.poses import FramePose  # noqa: E402
 from jaxtri.odometry.run import Run, track  # noqa: E402
 from jaxtri.odometry.settings import Status  # noqa: E402
@@ -72,7 +71,6 @@ QUICK = {"highway_traffic": 60, "other_room_cut": 80}
 LONG = 10_000
 COUNTS = ("confidently_wrong", "judged", "false_cuts", "missed_cuts")
 HAND = 9  # frames around the middle that show some of the hand
-_error = jax.jit(jax.vmap(lambda T, true: local(SE3.from_matrix(T), SE3.from_matrix(true))))
 
 
 class Judged(NamedTuple):
@@ -162,19 +160,6 @@ def gauge(run: Run, poses: list[FramePose], kept: np.ndarray, piece: np.ndarray)
     spread = np.array([np.asarray(poses[k].covariance)[:3, :3] for k in others])
     share = np.einsum("ti,tij,tj->t", ways, spread, ways) / (ways**2).sum(axis=1) ** 2
     return int(exact[0]), int(others[np.argmin(share)])
-
-
-def nees(poses: list[FramePose], frames: np.ndarray, first: int, second: int, truth: np.ndarray) -> np.ndarray:
-    """NEES of frames, the gauge being the pose of `first` and how far `second` is from it; NaN of these two."""
-    T = np.linalg.inv(world_camera(poses, np.append(frames, [first, second])))
-    true = np.linalg.inv(truth) @ truth[first]
-    distance = np.linalg.norm((T[-1] @ np.linalg.inv(T[-2]))[:3, 3])
-    true[:, :3, 3] *= distance / np.linalg.norm(true[second, :3, 3])
-    errors = np.asarray(_error(T[:-2], (true @ T[-2])[frames]))
-    found = np.full(len(frames), np.nan)
-    for i in np.flatnonzero(~np.isin(frames, (first, second))):
-        found[i] = errors[i] @ np.linalg.solve(np.asarray(poses[frames[i]].covariance), errors[i])
-    return found
 
 
 def judge(run: Run, poses: list[FramePose], truth: np.ndarray) -> Judged:

@@ -13,11 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from jaxtri.geometry.camera import Camera
 from jaxtri.synthetic import textures
-from jaxtri.synthetic.scene import Quad, Scene, box, pixel_rays, quad, render
+from jaxtri.synthetic.scene import Quad, Scene, box, pixel_rays, quad, render, transform
 
 FPS = 25.0
 EYE = 1.5  # height of the camera
 SKIN = (120, 150, 205)
+AWAY = np.eye(4)  # where another room is
+AWAY[0, 3] = 50.0
 Images = Iterator[np.ndarray]
 
 
@@ -181,8 +183,8 @@ def dissolve(n: int, seed: int) -> Situation:
     """Two rooms, one dissolving into the other over 20 frames."""
     each, mixed = (n - 20) // 2, 20
     T = _stroll(each + mixed, seed + 1, side=-1.0)
-    T[:, 0, 3] += 50.0  # another place
-    images, truth = _shots(seed, _moved(room(seed + 100), 50.0), T, each, mixed)
+    T = AWAY @ T
+    images, truth = _shots(seed, transform(room(seed + 100), AWAY), T, each, mixed)
     says = "mixed frames not tracking, then a new scale"
     return Situation(pinhole(), images, truth, says, ((each, each + mixed - 1),), each + mixed // 2)
 
@@ -196,14 +198,9 @@ def same_room_cut(n: int, seed: int) -> Situation:
 def other_room_cut(n: int, seed: int) -> Situation:
     """A cut to another room."""
     T = _stroll(n // 2, seed + 1, side=-1.0)
-    T[:, 0, 3] += 50.0
-    images, truth = _shots(seed, _moved(room(seed + 100), 50.0), T, n // 2, 0)
+    T = AWAY @ T
+    images, truth = _shots(seed, transform(room(seed + 100), AWAY), T, n // 2, 0)
     return Situation(pinhole(), images, truth, "lost at the cut, then a new scale", ((n // 2, n // 2),), n // 2)
-
-
-def _moved(scene: Scene, x: float) -> Scene:
-    quads = (Quad(np.add(q.corner, [x, 0, 0]), q.edge_u, q.edge_v, q.texture, q.integral) for q in scene.quads)
-    return Scene(tuple(quads), scene.background)
 
 
 def hand(n: int, seed: int) -> Situation:

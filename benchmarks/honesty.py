@@ -49,8 +49,11 @@ REGION = 12.59  # 95 % quantile of a chi-square of six degrees of freedom
 EVERY = 10
 
 
-def squares(poses: list[FramePose], first: int, second: int, T_world_camera: np.ndarray) -> np.ndarray:
-    """NEES of the frames after the start; of true poses (t, 4, 4), camera to world, one a frame of the run.
+_error = jax.jit(jax.vmap(lambda T, true: local(SE3.from_matrix(T), SE3.from_matrix(true))))
+
+
+def nees(poses: list[FramePose], frames: np.ndarray, first: int, second: int, T_world_camera: np.ndarray) -> np.ndarray:
+    """NEES of frames, of true poses (t, 4, 4), camera to world, one a frame of the run; NaN of the gauge's two.
 
     The gauge is the pose of frame `first`, and the distance from there to frame `second`.
     """
@@ -60,13 +63,19 @@ def squares(poses: list[FramePose], first: int, second: int, T_world_camera: np.
     assert end is not None
     true[:, :3, 3] *= np.linalg.norm((end @ np.linalg.inv(begin))[:3, 3]) / np.linalg.norm(true[second, :3, 3])
     true = true @ begin  # in the world of the estimate
-    error = jax.jit(lambda T, true: local(SE3.from_matrix(T), SE3.from_matrix(true)))
-    found = []
-    for k in range(first + 1, len(poses)):
-        if k != second and poses[k].T_camera_world is not None:
-            e = np.asarray(error(poses[k].T_camera_world, true[k]))
-            found.append(e @ np.linalg.solve(np.asarray(poses[k].covariance), e))
-    return np.array(found)
+    T = np.stack([poses[k].T_camera_world for k in frames])  # pyright: ignore[reportArgumentType, reportCallIssue]
+    errors, found = np.asarray(_error(T, true[frames])), np.full(len(frames), np.nan)
+    for i in np.flatnonzero(~np.isin(frames, (first, second))):
+        found[i] = errors[i] @ np.linalg.solve(np.asarray(poses[frames[i]].covariance), errors[i])
+    return found
+
+
+def squares(poses: list[FramePose], first: int, second: int, T_world_camera: np.ndarray) -> np.ndarray:
+    """`nees` of the frames after the start."""
+    posed = np.array([p.T_camera_world is not None for p in poses])
+    frames = np.arange(len(poses))
+    frames = frames[posed & (frames > first) & (frames != second)]
+    return nees(poses, frames, first, second, T_world_camera)
 
 
 def gauges(run: Run) -> dict[str, tuple[list[FramePose], int, int]]:

@@ -162,8 +162,9 @@ class Odometry(Archived):
         if not 0 <= frame <= len(self.poses):
             raise InputError(f"cut: frame {frame} of {len(self.poses)}; give one of those so far, or the next")
         self.finish()
-        begun = self._follower.begun if self._follower is not None else []
+        begun = []
         if self._follower is not None:
+            begun = self._follower.begun
             self._leave(present=False)
         if self.starts:
             self._recorder.stop(frame - 1, begun)
