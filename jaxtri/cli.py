@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from jaxtri.odometry.settings import Settings
     from jaxtri.vision.video import FrameSource
 
-
 GUESS = 0.05  # what a field of view that is guessed makes of the focal length, as a share
 USUAL = 60.0  # degrees: the field of view that the search begins with where nothing is known
 FROM_FOV, FROM_EXIF, FROM_FILE = 0.3, 0.1, 0.05  # what a focal length may be off by beforehand, as a share of it
@@ -72,15 +71,15 @@ class _Filter:
     """Frames that two segments share (--base paper)."""
     refine: bool = True
     """Adjust all keyframes together at the end of a file."""
+    loops: bool = True
+    """Find places again after a loss, and close loops."""
 
 
 @dataclass
 class _Output:
     overlay: bool = True
     """Write overlay.mp4."""
-    place: Annotated[
-        tuple[float, float] | None, arg(metavar="U V", help_behavior_hint="(default: on the dominant plane)")
-    ] = None
+    place: Annotated[tuple[float, float] | None, arg(metavar="U V", help_behavior_hint="(default: on a plane)")] = None
     """Pixel of the middle frame where the car stands."""
     recording: Switch = False
     """Write recording.rrd (extra viewer)."""
@@ -93,7 +92,7 @@ class Track:
     source: Source
     """A video file, a folder of frames, or the number of a camera."""
     camera: FileOption = None
-    """Calibration: camera.json, or of another tool; FILE#NAME of many."""
+    """Calibration: camera.json, or of another tool; FILE#NAME."""
     fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: from the video)")] = None
     """Horizontal field of view, if not calibrated."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("out")
@@ -361,10 +360,11 @@ def _how(options: Track) -> dict[str, Any]:
 
     base, t = Base(options.filter.base), options.tracker
     changes = {} if t.min_parallax is None else {"parallax_deg": t.min_parallax}
+    find = {"find_overlays": t.find_overlays, "find_dissolves": t.find_dissolves, "find_places": options.filter.loops}
     return {
         "base": base,
         "start": StartSettings.of(base, overlap=options.filter.overlap, poselib=t.starts == "poselib", **changes),
-        "klt": KLTSettings(t.features, find_overlays=t.find_overlays, find_dissolves=t.find_dissolves),
+        "klt": KLTSettings(t.features, **find),
     }
 
 
@@ -390,10 +390,10 @@ def _demo(options: Demo) -> None:
     said = asdict(options) | {"out": str(options.out)}
     done = demo(options.out, said, frames=options.frames, seed=options.seed, progress=not options.quiet)
     print(run_text(done.run, done.paths))
-    print("errors against the truth, in metres:")
-    print(errors_text(done.errors))
-    shown = options.out / "trajectory.png", options.out / "overlay.mp4"
-    print(f"look at {shown[0]} and {shown[1]}; the frames are in {done.frames}")
+    print(f"errors against the truth, in metres:\n{errors_text(done.errors)}")
+    print(
+        f"look at {options.out / 'trajectory.png'} and {options.out / 'overlay.mp4'}; the frames are in {done.frames}"
+    )
 
 
 if __name__ == "__main__":

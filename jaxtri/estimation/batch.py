@@ -4,8 +4,9 @@ Keyframes stand in blocks. A chunk of tracks are those that begin in one block a
 so what a chunk says concerns two blocks in a row, the normal equations of the poses are block tridiagonal, and time and
 memory grow with the length of the sequence alone. Most tracks are short, and in a large block they would be mostly
 empty places: so there are several layers of chunks, of smaller and larger blocks, and each track is in the first that
-holds it. In the last one tracks are cut. Chunks of a layer are all of one size and are worked out one after the other,
-as many as there are: so sequences of different length share what is compiled.
+holds it. In the last one tracks are cut; a place that is seen again is a factor of its own (`jaxtri.estimation.loops`).
+Chunks of a layer are all of one size and are worked out one after the other, as many as there are: so sequences of
+different length share what is compiled.
 Source: Triggs et al. 2000, sections 6 and 7.
 """
 
@@ -30,6 +31,7 @@ from jaxtri.estimation.bundle import (
     without_length,
 )
 from jaxtri.estimation.layers import Batch, Chunk, Layer, Noise
+from jaxtri.estimation.loops import Closed, pose_blocks, with_own
 from jaxtri.estimation.tridiagonal import Factors, Tridiagonal
 from jaxtri.geometry.epipolar import safe_divide, safe_norm
 from jaxtri.geometry.pose import compose, multiply, relative, retract
@@ -90,7 +92,7 @@ def _stepped(
     equations: Tridiagonal,
     tolerance: Float[Array, ""] | float,
 ) -> Estimate:
-    x = Factors.of(equations, now.damping).solve(equations.pull)
+    x = _factorised(batch, now.poses, equations, now.damping).solve(equations.pull)
     each = x.reshape(-1, 6)
     poses = moved_poses(batch, now.poses, each)
 
@@ -100,7 +102,7 @@ def _stepped(
         return points, chunk.cost(noise, poses, points)
 
     points, after = zip(*batch.mapped(moved, now.points), strict=True)
-    after = _sum(after)
+    after = _sum(after) + _owed(batch, poses)
     better = after <= before
     taken, left = (poses, points, after), (now.poses, now.points, before)
     poses, points, least = jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, left)
@@ -177,10 +179,9 @@ def _known(batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], e
     border = jnp.zeros((len(batch.present), *pulls[0].shape[2:]), noise.sigma.dtype)
     for layer, pull in zip(batch.layers, pulls, strict=True):
         border = border.at[layer.begin[:, None] + jnp.arange(pull.shape[1])].add(pull)
-    factors = Factors.of(equations, jnp.zeros((), noise.sigma.dtype))
-    free, b = free_errors(batch, poses), batch.layers[-1].size
-    blocks = factors.covariances().reshape(-1, b, 6, b, 6)[:, jnp.arange(b), :, jnp.arange(b)]
-    each = blocks.swapaxes(0, 1).reshape(-1, 6, 6)
+    factors = _factorised(batch, poses, equations, jnp.zeros((), noise.sigma.dtype))
+    free = free_errors(batch, poses)
+    each = pose_blocks(factors) if isinstance(factors, Factors) else factors.covariances()
     border = jnp.einsum("kab,kbp->kap", free, border)
     pulled = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(border.reshape(*equations.pull.shape, -1))
     return Known(free @ each @ free, pulled.reshape(border.shape), of_points)
@@ -214,7 +215,7 @@ def implicit(batch: Batch, noise: Noise, found: Estimate, *, tolerance: float = 
 
                 return jax.lax.map(one, (jnp.arange(len(layer.mask)), points))
 
-            return _sum(map(of_layer, batch.layers, new)) / 2
+            return (_sum(map(of_layer, batch.layers, new)) + _owed(batch, moved)) / 2
 
         return jax.grad(objective)(errors)
 
@@ -278,7 +279,21 @@ def normal_equations(
     batch: Batch, noise: Noise, poses: SE3, points: tuple[Points, ...], damping: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Tridiagonal]:
     """The cost, and what all chunks say of the poses, in the blocks of the last layer, with the gauge held."""
-    return assembled(batch, noise, poses, points, damping, lambda *_: ())[:2]
+    cost, equations, _ = assembled(batch, noise, poses, points, damping, lambda *_: ())
+    if batch.loops is None:
+        return cost, equations
+    return cost + _owed(batch, poses), with_own(batch.loops, poses, free_errors(batch, poses), equations)
+
+
+def _owed(batch: Batch, poses: SE3) -> Float[Array, ""] | float:
+    """To the loops."""
+    return 0.0 if batch.loops is None else batch.loops.cost(poses)
+
+
+def _factorised(batch: Batch, poses: SE3, equations: Tridiagonal, damping: Float[Array, ""]) -> Factors | Closed:
+    if batch.loops is None:
+        return Factors.of(equations, damping)
+    return Closed.of(batch.loops, poses, free_errors(batch, poses), equations, damping)
 
 
 def assembled(

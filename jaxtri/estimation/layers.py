@@ -9,6 +9,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtri.estimation.bundle import Linearised, PointPrior, Points, Views, cost, linearise
+from jaxtri.estimation.loops import Loops
 
 
 class Noise(NamedTuple):
@@ -93,11 +94,13 @@ class Batch(NamedTuple):
         layers: Blocks of each are several of the one before; k is at least two of the last ones.
         present: (k,) places that a keyframe stands in; the first one does, and its pose is given.
         farthest: Keyframe whose distance from the first is given: the unit of length.
+        loops: Places that are seen again, where there are any.
     """
 
     layers: tuple[Layer, ...]
     present: Bool[Array, " k"]
     farthest: Int[Array, ""]
+    loops: Loops | None = None
 
     def mapped(self, function: Callable[[Chunk, Points], Any], points: tuple[Points, ...]) -> list:
         """What a function gives of each chunk and its points, layer by layer; zeros behind the last chunk."""

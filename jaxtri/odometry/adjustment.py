@@ -21,12 +21,12 @@ FEWEST = 3  # keyframes that there must be: two are what a start has made of the
 
 
 def stretch(
-    odometry: Odometry, first: int, end: int, *, moving: bool = False
+    odometry: Odometry, frames: np.ndarray, *, moving: bool = False
 ) -> tuple[Segment, np.ndarray, Settings, float]:
     """Frames of a run, their keyframes, the settings with the noise that was found, and that over the one assumed."""
     assert odometry.settings is not None
-    segment = Segment.of(odometry, first, end, moving=moving)
-    noise = float(np.median([p.noise for p in odometry.poses[first:end]]))
+    segment = Segment.of(odometry, frames, moving=moving)
+    noise = float(np.median([odometry.poses[k].noise for k in frames]))
     # Robust weights widen with it, other than in the filter: this is the noise of all, not of a few blurred frames.
     settings = replace(odometry.settings, sigma=odometry.settings.sigma * noise)
     return segment, keyframes(settings, segment), settings, noise

@@ -1,6 +1,7 @@
 """A start on the host: a base pair among the frames that wait, the filter that goes on from it, the frames it fills."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,10 +19,17 @@ from jaxtri.odometry.track_pairs import State
 
 
 class Before(NamedTuple):
-    """What is known from before the camera was lost: its last pose, world to camera, and how deep the scene was."""
+    """What is known from before the camera was lost.
+
+    Attributes:
+        T_camera_world: Its last pose, world to camera.
+        depth: How deep the scene was.
+        start: Number of the start to come.
+    """
 
     T_camera_world: np.ndarray
     depth: float
+    start: int
 
 
 class Begun(NamedTuple):
@@ -61,6 +69,7 @@ def begin(
     reports = [*reports, *_backwards(settings, passed, first, state, world)]
     poses |= {f.index: FramePose.of(f.time, report) for f, report in reports}
     if before is not None:
+        poses = {k: replace(pose, start=before.start) for k, pose in poses.items()}
         poses[min(poses)].status = Status.RESTARTED
     if base is Base.TRACKS:
         follower: Follower = TrackPairs.after(settings, state, last, first.common(last))

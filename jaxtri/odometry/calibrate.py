@@ -118,11 +118,11 @@ def calibrate(
     odometry.trajectory()  # takes in what is queued, and raises where there is none
     first, end = max(segments(odometry), key=lambda s: s[1] - s[0])
     # With what seemed to move by itself: tracks disagree as much where the focal length is wrong.
-    segment, keys, settings, _ = stretch(odometry, first, end, moving=True)
+    segment, keys, settings, _ = stretch(odometry, np.arange(first, end), moving=True)
     if odometry.zoom is not None:  # it is geometric between keyframes: where it begins and ends it is not
         keys = keyframes(replace(settings, keyframe_flow=settings.keyframe_flow / 2), segment)
     begun = Adjustment.of(settings, segment, keys)
-    search = Search(odometry, (first, end), segment, keys, begun, guess or odometry.camera, prior, progress)
+    search = Search(odometry, segment, keys, begun, guess or odometry.camera, prior, progress)
     none = Found(np.zeros_like(search.known), search.known, None)
     found = search.run() if len(keys) >= FEWEST else none
     if not (np.isfinite(found.change).all() and np.isfinite(found.sd).all()):

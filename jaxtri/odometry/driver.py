@@ -5,12 +5,12 @@ The arithmetic of a frame is jitted and stands elsewhere; what happens rarely, a
 
 import math
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
-import jax
 import numpy as np
 
-from jaxtri.checks import ArrayOrList, booleans, image_noise, numbers, pixel_points
+from jaxtri.checks import ArrayOrList, image_noise
 from jaxtri.compilation import capacity
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.formats.archive import Archived
@@ -19,19 +19,20 @@ from jaxtri.geometry.zoom_curve import ZoomCurve, camera_at
 from jaxtri.odometry.beginning import Before, Begun, begin
 from jaxtri.odometry.beside import beside
 from jaxtri.odometry.followers import Follower
+from jaxtri.odometry.observing import Rows, observed
+from jaxtri.odometry.places import Found, Places, mark_apart
 from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.recorder import Recorder
 from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.settings import Base, Settings, StartSettings, Status
-from jaxtri.odometry.slots import Slotted, slotted
-from jaxtri.odometry.start import Observations, Start, Way, short_lived, too_slow
-from jaxtri.odometry.structure import Points, keep, no_points
+from jaxtri.odometry.slots import Slotted
+from jaxtri.odometry.start import BasePair, Observations, Start, Way, short_lived, too_slow
+from jaxtri.odometry.structure import Points, gathered, keep
 from jaxtri.trajectory import Trajectory
+from jaxtri.vision.places import Returns
 
 CATCH_UP = 2  # frames taken in for each that comes, where some came while a start was worked out
 AGAIN = 1.1  # flow, over that of the last attempt, from which a start from the same first frame is tried again
-
-normalise = jax.jit(lambda camera, pixels: camera.to_normalised(pixels))
 
 
 @dataclass
@@ -62,6 +63,7 @@ class Odometry(Archived):
         starts: Starts so far; more than one means that the camera was lost.
         scale_unknown_from: Frame from which the scale is a guess, None where there is none.
         reason: Why there is no start yet.
+        found: Where the camera was found again after it was lost.
     """
 
     camera: Camera
@@ -78,6 +80,7 @@ class Odometry(Archived):
     starts: int = field(default=0, init=False)
     scale_unknown_from: int | None = field(default=None, init=False)
     reason: str = field(default="no frames yet", init=False)
+    found: list[Found] = field(default_factory=list, init=False)
 
     _held: np.ndarray | None = field(default=None, init=False, repr=False)  # (capacity,) tracks in the slots
     _waiting: list[Observations] = field(default_factory=list, init=False, repr=False)  # may still become a base pair
@@ -91,6 +94,8 @@ class Odometry(Archived):
     _tried: tuple[int, float] = field(default=(-1, 0.0), init=False, repr=False)  # first frame and flow of an attempt
     _depth: float = field(default=1.0, init=False, repr=False)
     _changes: int = field(default=0, init=False, repr=False)
+    _world: int = field(default=0, init=False, repr=False)  # number of the start that the filter goes back to
+    _places: Places = field(default_factory=Places, init=False, repr=False)
     _recorder: Recorder = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -126,27 +131,31 @@ class Odometry(Archived):
         *,
         ids: ArrayOrList | None = None,
         quality: ArrayOrList | None = None,
+        returns: Returns | None = None,
     ) -> np.ndarray:
         """Take one frame; returns the mask (n,) of the tracks that the filter has found to be outliers.
 
         `pixels` (n, 2) are image points, `visible` (n,) says which rows hold one; what is not finite is not visible.
         `ids` (n,) are the numbers of the tracks, not negative: rows may come in any order and number. Without, a row
         is a track in every frame. `time` is in seconds. `quality` (n, 2) are the forward-backward errors in
-        pixels and the smaller eigenvalues of the patches, for `Settings.point_noise`.
+        pixels and the smaller eigenvalues of the patches, for `Settings.point_noise`. `returns` says which tracks are
+        earlier ones that had ended, as `FrameTracks.returns` has it: by it the camera is found again where it was lost.
 
         Raises `InputError`, and takes nothing, where an array has another shape, the time does not increase, two
         visible rows have one number, or there are more of them than `capacity`.
         """
         index = len(self.poses)
-        frame, tracks, ids = self._observe(index, pixels, visible, time, ids, quality)
-        if self.frame_time is None and self.poses:
-            self.frame_time = frame.time - self.poses[-1].time
-        self._held = tracks.ids
-        self._recorder.take(tracks)
+        rows, before = Rows.of(pixels, visible, ids, quality, returns), self.poses[-1].time if index else None
+        held = np.full(self.capacity or capacity(len(rows.ids)), -1) if self._held is None else self._held
+        frame, tracks = observed(index, time, before, rows, held, self.camera_at(time), self._settings.sigma.dtype)
+        if self.frame_time is None and before is not None:
+            self.frame_time = frame.time - before
+        self._held, self.capacity = tracks.ids, len(held)
+        self._recorder.take(tracks, rows.returns)
         lost = self.starts > 0 and self._follower is None  # else it only waits for its turn
         self.poses.append(FramePose(frame.time, Status.LOST if lost else Status.INITIALISING))
         self._queue.append(frame)
-        return np.isin(ids, self._take_in(index, CATCH_UP))
+        return np.isin(rows.ids, self._take_in(index, CATCH_UP))
 
     def camera_at(self, time_s: float) -> Camera:
         """The camera, with the focal length that it has at a time."""
@@ -162,10 +171,7 @@ class Odometry(Archived):
         if not 0 <= frame <= len(self.poses):
             raise InputError(f"cut: frame {frame} of {len(self.poses)}; give one of those so far, or the next")
         self.finish()
-        begun = []
-        if self._follower is not None:
-            begun = self._follower.begun
-            self._leave(present=False)
+        begun = self._leave(present=False)
         if self.starts:
             self._recorder.stop(frame - 1, begun)
         if self.base_pair is not None and self.base_pair[0] >= frame:
@@ -173,6 +179,8 @@ class Odometry(Archived):
             self.base_pair, self.starts, frame = None, 0, 0
         if self.scale_unknown_from is not None and self.scale_unknown_from >= frame:
             self.scale_unknown_from = None
+        self._places.forget(frame)
+        self.found = [again for again in self.found if again.frame < frame]
         status = Status.LOST if self.starts else Status.INITIALISING
         self.poses[frame:] = [FramePose(p.time, status) for p in self.poses[frame:]]
         self._waiting, self._passed, self._tried = [], [], (-1, 0.0)
@@ -190,6 +198,11 @@ class Odometry(Archived):
         """
         decided = len(self.poses) - len(self._queue)
         return self.poses[decided - 1] if decided else None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the camera was followed, and the newest frame that has been taken in shows nothing that was known."""
+        return self.starts > 0 and (self._follower is None or not (self.latest or self.poses[0]).status.measured)
 
     @property
     def status(self) -> Status:
@@ -217,16 +230,10 @@ class Odometry(Archived):
     def points(self) -> Points:
         """The points of all tracks so far, in the world frame, each as it was last known."""
         self.finish()
-        if self._follower is not None:
-            keep(self._points, self._follower.ended())
-        known = self._points.copy()
-        if self._follower is not None:
-            keep(known, self._follower.present())
-        if not known:
-            return no_points()
-        ids = np.array(sorted(known))
-        xyz, covariance = (np.stack([known[i][k] for i in ids]) for k in (0, 1))
-        return Points(ids, xyz, covariance)
+        if self._follower is None:
+            return gathered(self._points)
+        keep(self._points, self._follower.ended())
+        return gathered(self._points, self._follower.present())
 
     def recording(self) -> Recording:
         """The tracks and base pairs so far, up to where the camera is lost, for `jaxtri.replay`.
@@ -249,36 +256,10 @@ class Odometry(Archived):
         """The tracks of all frames so far, where `record` is on."""
         return self._recorder.tracks
 
-    def _observe(
-        self,
-        index: int,
-        pixels: ArrayOrList,
-        visible: ArrayOrList,
-        time: float,
-        ids: ArrayOrList | None,
-        quality: ArrayOrList | None,
-    ) -> tuple[Observations, Slotted, np.ndarray]:
-        """The frame as the filters take it, its tracks in slots, and the number of each row."""
-        z = numbers("pixels", pixels, ("n", 2))
-        seen = booleans("visible", visible, (len(z),))
-        if not self.poses:
-            pixel_points("pixels", z[seen])
-        rows = np.arange(len(z)) if ids is None else numbers("ids", ids, (len(z),), np.int64)
-        known = None if quality is None else numbers("quality", quality, (len(z), 2))
-        if len(rows) and rows[seen].min(initial=0) < 0:
-            raise InputError(f"ids: {rows[seen].min()} is negative; number the tracks from 0")
-        if not math.isfinite(time) or (self.poses and not time > self.poses[-1].time):
-            before = f" does not follow {self.poses[-1].time}" if self.poses else " is no number of seconds"
-            raise InputError(f"frame {index}: its time {time}{before}")
-        if self.capacity is None:
-            self.capacity = capacity(len(z))
-        held = np.full(self.capacity, -1) if self._held is None else self._held
-        tracks = slotted(held, z, seen, rows, known)
-        dtype = self._settings.sigma.dtype
-        u = np.asarray(normalise(self.camera_at(time), tracks.pixels.astype(dtype)))
-        tracks = tracks._replace(visible=tracks.visible & np.isfinite(u).all(axis=1))
-        quality = tracks.quality.astype(dtype)
-        return Observations(index, float(time), u, tracks.visible, tracks.ids, quality), tracks, rows
+    @property
+    def returns(self) -> dict[int, Returns]:
+        """Tracks of earlier frames that were found again, by frame, where `record` is on."""
+        return self._recorder.returns
 
     def _dt(self, index: int) -> float:
         if index == 0 or not self.frame_time:
@@ -293,19 +274,31 @@ class Odometry(Archived):
                 search = self._search = self._search or beside(self._begin, "start")
                 if newest < self._waiting[-1].index + self._start.lag:
                     break
-                self._settle(search.result())
+                again = next((k for k, f in enumerate(self._queue) if self._find_again(f)), None)
+                if again is None:
+                    self._settle(search.result())
+                else:
+                    del self._queue[: again + 1]
             if not self._queue or len(outliers) >= most:
                 break
             frame = self._queue.pop(0)
             if self._follower is None:
-                self._waiting.append(frame)
-                self._try_start()
+                if not self._find_again(frame):
+                    self._waiting.append(frame)
+                    self._try_start()
                 continue
+            before = copy(self._follower)
             report = self._follower.follow(frame, self._dt(frame.index))
-            self.poses[frame.index] = FramePose.of(frame.time, report)
+            pose = self.poses[frame.index] = FramePose.of(frame.time, report, self._world)
+            if not pose.status.measured and self.poses[frame.index - 1].status.measured:
+                self._places.see(frame.index - 1, self._world, before, last=True)
+            if self._find_again(frame):
+                continue
+            if pose.status is Status.TRACKING:
+                self._places.see(frame.index, self._world, self._follower)
             self._recorder.judge(frame.index, np.asarray(report.moving))
             outliers.append(frame.ids[np.asarray(report.drop)])
-            if self.poses[frame.index].status is Status.LOST:
+            if pose.status is Status.LOST:
                 self._lose(frame)
         return np.concatenate(outliers or [np.zeros(0, np.int64)])
 
@@ -349,7 +342,7 @@ class Odometry(Archived):
             self.base_pair = begun.pair.first, begun.pair.second
         elif self.scale_unknown_from is None:
             self.scale_unknown_from = min(begun.poses)
-        self._follower = begun.follower
+        self._follower, self._world = begun.follower, self.starts
         self.starts += 1
         self._waiting, self._passed = [], []
 
@@ -361,27 +354,46 @@ class Odometry(Archived):
         before = None
         if self.starts:
             held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
-            before = Before(held, self._depth)
+            before = Before(held, self._depth, self.starts)
         assert isinstance(self.base, Base)
         waiting, passed = self._waiting, self._passed
         return begin(self._settings, self._start, self.base, waiting, passed, self._dt, before)
 
+    def _find_again(self, frame: Observations) -> bool:
+        """Go on from an earlier place, where the camera is lost or its scale a guess and enough tracks are back."""
+        followed = self._follower is not None and self.poses[frame.index].status.measured
+        found = self._places.find(self._settings, frame, self._start.points, self._world if followed else self.starts)
+        if found is None:
+            return False
+        place, follower, report = found
+        self._recorder.stop(frame.index, self._leave(present=True))
+        since = mark_apart(self.poses[: frame.index], place.start, frame.index)
+        if self.scale_unknown_from is not None and self.scale_unknown_from >= since:
+            self.scale_unknown_from = None
+        pose = replace(FramePose.of(frame.time, report, place.start), status=Status.FOUND)
+        self.poses[frame.index] = pose
+        self.found.append(Found(frame.index, place.frame, since, pose.used))
+        self._follower, self._world = follower, place.start
+        self._search, self._seeking = None, False
+        self._waiting, self._passed, self._tried = [], [], (-1, 0.0)
+        return True
+
     def _lose(self, frame: Observations) -> None:
         """The camera is lost: start again from here."""
-        assert self._follower is not None
-        self._recorder.stop(frame.index, self._follower.begun)
+        self._recorder.stop(frame.index, self._leave(present=True))
         for queued in self._queue:
             self.poses[queued.index].status = Status.LOST
-        self._leave(present=True)
         self._waiting, self._tried = [frame], (-1, 0.0)
         self.reason = "too few points agreed with any motion"
 
-    def _leave(self, *, present: bool) -> None:
-        """The end of a filter: keep its points, of the tracks that have ended, and of those at `present`."""
-        assert self._follower is not None
-        self._changes += len(self._follower.begun)
-        self._depth = self._follower.depth
-        keep(self._points, self._follower.ended())
+    def _leave(self, *, present: bool) -> list[BasePair]:
+        """The end of a filter, if there is one: its later base pairs; its points are kept, those at `present` too."""
+        follower, self._follower = self._follower, None
+        if follower is None:
+            return []
+        self._changes += len(follower.begun)
+        self._depth = follower.depth
+        keep(self._points, follower.ended())
         if present:
-            keep(self._points, self._follower.present())
-        self._follower = None
+            keep(self._points, follower.present())
+        return follower.begun

@@ -15,7 +15,8 @@ from jaxtri.estimation.calibration import Told
 from jaxtri.geometry.camera import Camera
 from jaxtri.geometry.zoom_curve import ZoomCurve
 from jaxtri.odometry.adjustment import Adjustment
-from jaxtri.odometry.driver import Odometry, normalise
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.observing import normalise
 from jaxtri.odometry.stretches import Segment
 
 # What is known beforehand: of the focal length, as a share of it, where it is a guess of what most cameras have (24 to
@@ -65,7 +66,6 @@ class Search:
     """
 
     odometry: Odometry
-    frames: tuple[int, int]
     segment: Segment
     keys: np.ndarray
     begun: Adjustment
@@ -135,7 +135,7 @@ class Search:
     @cached_property
     def _times(self) -> np.ndarray:
         """Their times, seconds."""
-        return np.array([self.odometry.poses[self.frames[0] + int(k)].time for k in self.keys[self._at]])
+        return np.array([self.odometry.poses[k].time for k in self.segment.frames[self.keys[self._at]]])
 
     @cached_property
     def _share(self) -> np.ndarray:
@@ -223,7 +223,7 @@ class Search:
 
     def _mean(self) -> float:
         """Logarithm of the mean focal length, over all frames, over the first: it is the camera's own."""
-        times = np.array([p.time for p in self.odometry.poses[slice(*self.frames)]])
+        times = np.array([self.odometry.poses[k].time for k in self.segment.frames])
         return float(np.interp(times, self._times, np.r_[0.0, self._x[self._p :]]).mean())
 
     def _seen(self, camera: Camera) -> batch.Batch:
@@ -232,7 +232,7 @@ class Search:
         curve = ZoomCurve(self._times, zoom, none)
         dtype, layers = self.segment.u.dtype, []
         u = np.zeros((len(self.keys), *self.segment.u.shape[1:]), dtype)
-        for k, frame in enumerate(self.frames[0] + self.keys):
+        for k, frame in enumerate(self.segment.frames[self.keys]):
             seen_by = curve.camera(camera, self.odometry.poses[frame].time)
             u[k] = np.asarray(normalise(seen_by, self.odometry.tracks[frame].pixels.astype(dtype)))
         pieces = self.begun.pieces
@@ -252,10 +252,10 @@ class Search:
         pieces = self.begun.pieces
         score = pieces.each(scores, (size,))
         count = np.bincount(pieces.piece)
-        at = self.odometry.tracks[self.frames[0]].pixels  # the size of the picture, where it is not known
+        at = self.odometry.tracks[self.segment.frames[0]].pixels  # the size of the picture, where it is not known
         camera = self.camera
         extent = np.array([camera.width or at[:, 0].max(), camera.height or at[:, 1].max()])
-        frames = self.frames[0] + self.keys[pieces.key]
+        frames = self.segment.frames[self.keys[pieces.key]]
         pixels = np.array([self.odometry.tracks[f].pixels[s] for f, s in zip(frames, pieces.slot, strict=True)])
         mean = np.stack([np.bincount(pieces.piece, pixels[:, i] / extent[i]) / count for i in (0, 1)])
         column, row = (mean * CELLS).astype(int).clip(0, CELLS - 1)

@@ -33,6 +33,8 @@ class FramePose:
         noise: Standard deviation that the points were taken to have, over the one assumed.
         zoom: Focal length over that of the first frame, where it is found to change though the camera is taken to have
             one; NaN elsewhere.
+        start: Number of the start, from 0, in whose world and at whose scale the pose is.
+        found: Frame in which the scene of an earlier start was found again after this one; None elsewhere.
     """
 
     time: float
@@ -45,14 +47,16 @@ class FramePose:
     parallax_deg: float = float("nan")
     noise: float = 1.0
     zoom: float = float("nan")
+    start: int = 0
+    found: int | None = None
 
     @classmethod
-    def of(cls, time: float, report: Report) -> "FramePose":
+    def of(cls, time: float, report: Report, start: int = 0) -> "FramePose":
         """The pose of a frame from what the filter reports of it."""
         said, status = report.diagnostics, Status(int(report.status))
         covariance = np.asarray(report.covariance, np.float64)
         counts, angle = (int(said.used), float(said.nis), int(said.measured)), math.degrees(report.parallax)
-        return cls(time, status, pose_matrix(report.pose), covariance, *counts, angle, float(report.noise))
+        return cls(time, status, pose_matrix(report.pose), covariance, *counts, angle, float(report.noise), start=start)
 
     @property
     def rotation_sd_deg(self) -> float:
@@ -75,6 +79,8 @@ class FramePose:
             "only {used} of {measured} points agree": found.minority,
             "its rotation is known to {sd:.1f} degrees": found.blurred,
             "the camera zooms, and has {zoom:.2f} times the focal length of the first frame": not math.isnan(self.zoom),
+            "what was lost is found again in frame {found}: this is another place, or something that moved before the "
+            "camera, and its scale is a guess": self.found is not None,
         }
         numbers = {
             "worse": math.sqrt(self.nis / (2 * self.used)) if self.used else math.nan,
@@ -82,6 +88,7 @@ class FramePose:
             "measured": self.measured,
             "sd": self.rotation_sd_deg,
             "zoom": self.zoom,
+            "found": self.found,
         }
         return [word.format(**numbers) for word, true in words.items() if true]
 

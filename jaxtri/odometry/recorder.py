@@ -11,6 +11,7 @@ from jaxlie import SO3
 from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.slots import Slotted
 from jaxtri.odometry.start import BasePair
+from jaxtri.vision.places import Returns
 
 
 @dataclass
@@ -22,16 +23,20 @@ class Recorder:
         tracks: Of all frames so far, in slots.
         pairs: Base pairs of the segments: the first, and once the camera is lost those that followed it.
         lost: Frame in which the camera was lost first; None before.
+        returns: Of the frames in which tracks of earlier ones were found again.
     """
 
     on: bool
     tracks: list[Slotted] = field(default_factory=list)
     pairs: list[BasePair] = field(default_factory=list)
     lost: int | None = None
+    returns: dict[int, Returns] = field(default_factory=dict)
 
-    def take(self, tracks: Slotted) -> None:
+    def take(self, tracks: Slotted, returns: Returns | None) -> None:
         """The next frame."""
         if self.on:
+            if returns is not None:
+                self.returns[len(self.tracks)] = returns
             self.tracks.append(tracks)
 
     def judge(self, frame: int, moving: np.ndarray) -> None:

@@ -114,9 +114,9 @@ def track(
     try:
         # What the filter gives up of a frame the next one shows no more, and its slots are free from the one after
         # that on: the same whether the flow or the filter is faster.
-        outliers = np.zeros(0, np.int64)
+        outliers, lost = np.zeros(0, np.int64), False
         frames = islice(source, max_frames)
-        with contextlib.closing(_followed(frames, camera, features, clock, lambda: outliers)) as followed:
+        with contextlib.closing(_followed(frames, camera, features, clock, lambda: (outliers, lost))) as followed:
             for frame, tracks in followed:
                 with clock.part("filter"):
                     if tracks.dissolved is not None:
@@ -125,8 +125,15 @@ def track(
                     tracks = tracks._replace(visible=tracks.visible & ~np.isin(tracks.ids, outliers))
                     _sample(colours, tracks, frame.image)
                     quality = np.stack([tracks.error, tracks.eigenvalue], axis=1)
-                    give_up = odometry.add(tracks.pixels, tracks.visible, frame.time_s, ids=tracks.ids, quality=quality)
-                    outliers = tracks.ids[give_up]
+                    give_up = odometry.add(
+                        tracks.pixels,
+                        tracks.visible,
+                        frame.time_s,
+                        ids=tracks.ids,
+                        quality=quality,
+                        returns=tracks.returns,
+                    )
+                    outliers, lost = tracks.ids[give_up], odometry.lost
                 newest = odometry.poses[-1]
                 bar.set_postfix_str(f"{newest.status.name.lower()}, {newest.used} points", refresh=False)
                 bar.update()
@@ -208,9 +215,12 @@ class _Clock:
 
 
 def _followed(
-    source: Iterable[Frame], camera: Camera, features: KLT, clock: _Clock, given_up: Callable[[], np.ndarray]
+    source: Iterable[Frame], camera: Camera, features: KLT, clock: _Clock, said: Callable[[], tuple[np.ndarray, bool]]
 ) -> Generator[tuple[Frame, FrameTracks], None, None]:
-    """Every frame with its tracks, the next one followed already; `given_up` are the outliers of the one before."""
+    """Every frame with its tracks, the next one followed already.
+
+    What is `said` of the one before are its outliers, and whether the camera is lost.
+    """
 
     def follow(frame: Frame) -> FrameTracks:
         with clock.part("optical flow"):
@@ -229,7 +239,8 @@ def _followed(
         now = following()
         while now is not None:
             frame, tracks = now[0], now[1].result()
-            features.drop(given_up())
+            outliers, features.lost = said()
+            features.drop(outliers)
             now = following()
             yield frame, tracks
 
@@ -338,6 +349,7 @@ def _statistics(odometry: Odometry, poses: list[FramePose]) -> dict[str, object]
         "starts": odometry.starts,
         "restarts": odometry.changes,
         "scale_unknown_from_frame": odometry.scale_unknown_from,
+        "found": [again._asdict() for again in odometry.found],
         "base_pair": odometry.base_pair,
         "keyframes": odometry.keyframes,
         "points_used_per_frame": float(np.mean(used)) if used else 0.0,

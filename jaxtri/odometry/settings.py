@@ -48,6 +48,8 @@ class Status(IntEnum):
         RESTARTED: The first frame of a new start, after the camera was lost. From here on the scale is a guess.
         LOST: There is no pose: the camera coasted for too long, or too few tracks are left.
         UNCERTAIN: The pose is measured, but its numbers do not hold together: `FramePose.doubts` says in words why.
+        FOUND: The first frame in which a scene that was lost is found again: the pose is measured, in the world and at
+            the scale of before.
     """
 
     INITIALISING = 0
@@ -56,11 +58,12 @@ class Status(IntEnum):
     RESTARTED = 3
     LOST = 4
     UNCERTAIN = 5
+    FOUND = 6
 
     @property
     def measured(self) -> bool:
         """Whether the pose comes from what this frame shows."""
-        return self in (Status.TRACKING, Status.UNCERTAIN, Status.RESTARTED)
+        return self in (Status.TRACKING, Status.UNCERTAIN, Status.RESTARTED, Status.FOUND)
 
 
 CALIBRATED = 0.003  # what a good calibration knows the focal length to, as a share of it

@@ -70,3 +70,12 @@ def slotted(
     if quality is not None:
         found.quality[slots] = quality[rows]
     return found
+
+
+def slots(ids: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """The slot (m,) of each of some tracks, by the numbers of those in all slots (c,); -1 where it is in none."""
+    if not len(ids):
+        return np.full(len(numbers), -1)
+    order = np.argsort(ids, kind="stable")
+    at = order[np.searchsorted(ids, numbers, sorter=order).clip(max=len(ids) - 1)]
+    return np.where(ids[at] == numbers, at, -1)

@@ -15,6 +15,7 @@ from jaxtri.geometry.pose import compose, identity
 from jaxtri.odometry import track_pairs
 from jaxtri.odometry.settings import Report, Settings, StartSettings
 from jaxtri.vision.hypotheses import FARTHER, GATE, SHARES, Hypothesis, hypotheses
+from jaxtri.vision.places import Returns
 
 # Hypotheses up to RIVAL_SHARE times the cost of the best, and RIVAL_MORE, explain the pair about equally well. Before a
 # plane the two poses cost the same; the margin keeps noise from deciding between them.
@@ -38,6 +39,7 @@ class Observations:
         visible: (n,) slots that hold a point.
         ids: (n,) number of the track in each slot.
         quality: (n, 2) forward-backward error in pixels, and smaller eigenvalue of the patch.
+        returns: Which of them are tracks of earlier frames, where that was found.
     """
 
     index: int
@@ -46,6 +48,7 @@ class Observations:
     visible: np.ndarray
     ids: np.ndarray
     quality: np.ndarray
+    returns: Returns | None = None
 
     def common(self, other: "Observations") -> np.ndarray:
         """Slots that hold the same track in both frames."""

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtri.odometry.driver import Odometry, normalise
+from jaxtri.odometry.driver import Odometry
+from jaxtri.odometry.observing import normalise
 from jaxtri.odometry.settings import Settings, Status
 from jaxtri.odometry.slots import Slotted
 
@@ -20,7 +21,8 @@ def segments(odometry: Odometry) -> list[tuple[int, int]]:
     if odometry.base_pair is None:
         return []
     poses = odometry.poses
-    starts = [odometry.base_pair[0], *(k for k, p in enumerate(poses) if p.status is Status.RESTARTED)]
+    again = {p.frame for p in odometry.found} | {k for k, p in enumerate(poses[1:], 1) if p.start != poses[k - 1].start}
+    starts = sorted({odometry.base_pair[0]} | {k for k in again if poses[k].T_camera_world is not None})
     ends = [*starts[1:], len(poses)]
     return [
         (start, next((k for k in range(start, end) if poses[k].status in (Status.LOST, Status.INITIALISING)), end))
@@ -28,39 +30,59 @@ def segments(odometry: Odometry) -> list[tuple[int, int]]:
     ]
 
 
-class Segment(NamedTuple):
-    """The frames of a stretch: normalised points (t, n, 2), which are seen, and the numbers of the tracks."""
+def worlds(odometry: Odometry) -> list[np.ndarray]:
+    """Frames (t,) that the camera was followed over in one world, at one scale, for each start."""
+    found: dict[int, list[np.ndarray]] = {}
+    for first, end in segments(odometry):
+        found.setdefault(odometry.poses[first].start, []).append(np.arange(first, end))
+    return [np.concatenate(frames) for frames in found.values()]
 
+
+class Segment(NamedTuple):
+    """The frames of a world: their numbers (t,), normalised points (t, n, 2), which are seen, numbers of the tracks."""
+
+    frames: np.ndarray
     u: np.ndarray
     seen: np.ndarray
     ids: np.ndarray
     T: np.ndarray  # (t, 4, 4) world to camera, as it was
     times: np.ndarray  # in frames
     measured: np.ndarray  # (t,) frames whose pose comes from what they show
+    places: np.ndarray  # (t,) frames that are seen again, or see one
+    begins: np.ndarray  # (f,) places of frames in which the camera was found again
 
     @classmethod
-    def of(cls, odometry: Odometry, first: int, end: int, *, moving: bool = False) -> "Segment":
+    def of(cls, odometry: Odometry, frames: np.ndarray, *, moving: bool = False) -> "Segment":
         """Of frames of a run, as it recorded them; with what was taken to move by itself only where that is asked."""
-        tracks: list[Slotted] = odometry.tracks[first:end]
+        tracks: list[Slotted] = [odometry.tracks[k] for k in frames]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
-        poses = odometry.poses[first:end]
+        poses = [odometry.poses[k] for k in frames]
         cameras = (odometry.camera_at(p.time) for p in poses)
         u = np.stack([np.asarray(normalise(c, t.pixels.astype(dtype))) for c, t in zip(cameras, tracks, strict=True)])
         seen = np.stack([t.visible & (moving | ~t.moving) for t in tracks]) & np.isfinite(u).all(axis=2)
         T = np.stack([p.T_camera_world for p in poses])  # pyright: ignore[reportArgumentType, reportCallIssue]
         times = np.array([p.time for p in poses]) / (odometry.frame_time or 1.0)
+        measured = np.array([p.status.measured for p in poses])
+        begins = np.flatnonzero(np.isin(frames, [p.frame for p in odometry.found]))
+        places = np.isin(frames, [k for at, found in odometry.returns.items() for k in (at, found.frame)])
+        places[begins] = True
+        for k in begins[begins > 0]:
+            places[:k][np.flatnonzero(measured[:k])[-1:]] = True
         return cls(
+            frames,
             np.where(seen[..., None], u, 0.0),
             seen,
             np.where(seen, np.stack([t.ids for t in tracks]), -1),
             T,
             times,
-            np.array([p.status.measured for p in poses]),
+            measured,
+            places & measured,
+            begins,
         )
 
 
 def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
-    """Frames between which the tracks have moved, the first and the last among them."""
+    """Frames between which the tracks have moved, with the first, the last, and places that are seen again."""
     flow, common = float(settings.keyframe_flow), float(settings.keyframe_common)
     keys, way = [0], np.zeros(segment.seen.shape[1])
     for k in range(1, len(segment.u)):
@@ -69,7 +91,7 @@ def keyframes(settings: Settings, segment: Segment) -> np.ndarray:
         way[both] = np.linalg.norm(segment.u[k][both] - segment.u[key][both], axis=1)
         few = both.sum() < max(common, LEFT * segment.seen[key].sum())
         # Each as far as it was followed: what goes along with the camera stays in the picture longest.
-        if segment.measured[k] and (few or np.median(way[segment.seen[key]]) > flow):
+        if segment.places[k] or (segment.measured[k] and (few or np.median(way[segment.seen[key]]) > flow)):
             keys.append(k)
             way[:] = 0
     last = len(segment.u) - 1

@@ -44,6 +44,17 @@ def keep(known: dict[int, tuple[np.ndarray, np.ndarray]], points: Points) -> Non
             known[int(i)] = (x, c)
 
 
+def gathered(known: dict[int, tuple[np.ndarray, np.ndarray]], more: Points | None = None) -> Points:
+    """Points that are known, and some more, by number."""
+    if more is not None:
+        known = known.copy()
+        keep(known, more)
+    if not known:
+        return no_points()
+    ids = np.array(sorted(known))
+    return Points(ids, *(np.stack([known[i][k] for i in ids]) for k in (0, 1)))
+
+
 @jax.jit
 def world_points(bank: Bank | BasePoint, settings: Settings) -> tuple[jax.Array, jax.Array, jax.Array]:
     """World points (n, 3) of a bank, the covariance of each, and which of them are known well enough to be shown."""

@@ -271,6 +271,36 @@ def step(
     return new, Report(new.belief.mean.pose, covariance, status, keyframe, parallax, drop, said, state.noise, moving)
 
 
+def recalled(state: State, source: Int[Array, " n"], kept: Bool[Array, " n"], pose: SE3) -> State:
+    """An earlier state, to go on from at another pose, which is not known: tracks that it knew are seen again.
+
+    `source` is a permutation: the slot that each slot's track had; `kept` marks those that go on. What is known of the
+    points, and what they owe to the keyframes, is as it was.
+    """
+    window, dtype = state.window, state.seen.dtype
+    base, lever, angle, usable = state.tracks
+    base = jax.tree.map(lambda x: x[source], base)
+    tracks = Tracks(base, lever[..., source], angle[source], usable[source] & kept)
+    window = window._replace(
+        observed=window.observed[..., source],
+        mask=window.mask[:, source],
+        X=window.X[:, source],
+        known=window.known[source],
+    )
+    sd = jnp.stack([state.depth, jnp.ones_like(state.depth)])
+    unknown = jnp.diag(jnp.repeat(jnp.concatenate([sd, START_VELOCITY * sd]), 3) ** 2)
+    return state._replace(
+        belief=ekf.Belief(Twist(pose, jnp.zeros(6, dtype)), unknown),
+        tracks=tracks,
+        window=window,
+        sensitivity=jnp.zeros_like(state.sensitivity),
+        seen=state.seen[source],
+        held=kept,
+        coasted=jnp.zeros_like(state.coasted),
+        agreed=jnp.ones_like(state.agreed),
+    )
+
+
 def _owed(
     model: BasePairs,
     mean: Twist,

@@ -7,7 +7,8 @@ from jaxtri.odometry.calibrate import Calibration
 from jaxtri.odometry.run import Run
 from jaxtri.trajectory import Evaluation
 
-SHOWN = 4  # parts of the picture that are named of those that are ignored
+SHOWN = 4  # of parts of the picture that are ignored, and of places that are seen again, so many are named
+COUNTS = 0.25  # weight of a place from which it counts
 
 
 def run_text(run: Run, paths: Iterable[Path]) -> str:
@@ -38,11 +39,23 @@ def run_text(run: Run, paths: Iterable[Path]) -> str:
             f"refined by {refined['keyframes']} frames at once in {seconds['refinement']:.1f} s: moved by "
             f"{refined['moved_percent_of_path']:.2g} % of the path and {refined['turned_deg']:.2g} degrees"
         )
+        lines += _loops(refined)
+    lines += [f"lost, and found again in frame {again.frame}, at the scale of before" for again in run.odometry.found]
     if s["scale_unknown_from_frame"] is not None:
         lines.append(f"the camera was lost: from frame {s['scale_unknown_from_frame']} on the scale is a guess")
     if s["interrupted"]:
         lines.append("interrupted: these are the frames up to there")
     return "\n".join([*lines, *(f"  {path}" for path in paths)])
+
+
+def _loops(refined: dict) -> list[str]:
+    """A line on the places that were seen again and count; none where there are none."""
+    counted = [loop for part in refined["parts"] for loop in part.get("loops", ()) if loop["weight"] > COUNTS]
+    if not counted:
+        return []
+    frames = ", ".join(f"{loop['frame']} (of {loop['place']})" for loop in counted[:SHOWN])
+    more = f" and {len(counted) - SHOWN} more" if len(counted) > SHOWN else ""
+    return [f"places seen again in frame {frames}{more}"]
 
 
 def _camera(found: Calibration) -> str:

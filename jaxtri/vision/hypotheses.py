@@ -16,6 +16,7 @@ from jaxtri.geometry.epipolar import essential, inverse_depth, parallax, sampson
 HYPOTHESES = 8  # their number is fixed, so that one compilation serves
 CONFIDENCE = 0.9999  # that a robust estimator drew a sample without outliers: a start is rare, so it may take time
 LEAST = 8  # tracks: what the 8-point algorithm needs, and fewer leave a pose with hardly anything to be judged by
+DRAWS = 1000  # samples of a resection, at most: with half of the points wrong a tenth would do
 GATE = 4.0  # sigmas of Sampson distance within which a track agrees; beyond, all cost the same
 # Quantiles of flow and parallax by which motion is judged: that of half of the tracks, or FARTHER times that of a
 # quarter. What is far behind, or goes along with the camera, shows none, and may be most of what is seen.
@@ -103,6 +104,29 @@ def _eight_point(u1: np.ndarray, u2: np.ndarray, threshold: float) -> np.ndarray
     S = np.diag([FOCAL, FOCAL, 1.0])
     U, _, Vt = np.linalg.svd(S @ F @ S)
     return U @ np.diag([1.0, 1.0, 0.0]) @ Vt
+
+
+def resection(X: np.ndarray, u: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """The pose (4, 4), world to camera, that most points X (n, 3) agree with, and which (n,) do; None if none is found.
+
+    `u` (n, 2) are normalised, `threshold` is in the same units.
+    """
+    if len(X) < LEAST:
+        return None
+    options = {"reprojectionError": FOCAL * threshold, "confidence": CONFIDENCE, "iterationsCount": DRAWS}
+    try:
+        ok, turn, shift, rows = cv2.solvePnPRansac(
+            X, FOCAL * u, np.diag([FOCAL, FOCAL, 1.0]), None, flags=cv2.SOLVEPNP_SQPNP, **options
+        )
+    except cv2.error:  # points in one place
+        return None
+    if not ok or rows is None or len(rows) < LEAST:
+        return None
+    rows = np.asarray(rows, int).ravel()
+    turn, shift = cv2.solvePnPRefineLM(X[rows], FOCAL * u[rows], np.diag([FOCAL, FOCAL, 1.0]), None, turn, shift)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    return (T, np.isin(np.arange(len(X)), rows)) if np.isfinite(T).all() else None
 
 
 def homography_poses(u1: np.ndarray, u2: np.ndarray, threshold: float) -> list:

@@ -1,6 +1,5 @@
 """Feature tracks from images: Shi-Tomasi corners followed by pyramidal Lucas-Kanade, through OpenCV."""
 
-import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,14 +9,13 @@ import numpy as np
 from jaxtri.errors import ResolutionChangeError
 from jaxtri.vision.bars import Bars
 from jaxtri.vision.dissolves import Dissolves
+from jaxtri.vision.flow import Flow, shift_between
 from jaxtri.vision.overlays import Ignored, Overlays
 from jaxtri.vision.pictures import Glance
+from jaxtri.vision.places import FEWEST, Places, Returns
 
-STEPS, CLOSE = 30, 0.003  # optical flow ends after so many steps, or when a step is shorter than so many pixels
 BLOCK = 5  # pixels across, over which the strength of a corner is summed: a corner, and not the noise of one pixel
 LOST = 0.5  # share of the features below which the flow is sought again from elsewhere
-COARSE, TILES, FLAT = 160, 3, 2.0  # pixels across, tiles each way, and deviation of grey levels that says nothing
-MOST = 0.9  # share of the points whose flow the way back must reach: for the few longest all would take a level more
 
 
 @dataclass(frozen=True)
@@ -46,6 +44,8 @@ class KLTSettings:
             a time code or a bonnet hold features that say that the camera stands.
         find_dissolves: Give up all features where one shot is found to have dissolved into another, 5 to 17 frames
             after its middle. Without it features go over from the one to the other, and with them a wrong scale.
+        find_places: Look for features of earlier frames where most of those that are followed are gone: what was lost
+            is found again, and a place that was left is recognised. Costs a description of the features each time.
     """
 
     capacity: int = 800
@@ -59,6 +59,7 @@ class KLTSettings:
     cells: int = 8
     find_overlays: bool = True
     find_dissolves: bool = True
+    find_places: bool = True
 
 
 class FrameTracks(NamedTuple):
@@ -76,6 +77,7 @@ class FrameTracks(NamedTuple):
             (`cv2.OPTFLOW_LK_GET_MIN_EIGENVALS`); NaN where it is not known.
         dissolved: Where a dissolve is found in this frame, the first frame of it: what was followed since then belongs
             to neither shot, and all features are new. None elsewhere.
+        returns: Features of earlier frames that are found again in this one, where they were looked for and are enough.
     """
 
     pixels: np.ndarray
@@ -85,6 +87,7 @@ class FrameTracks(NamedTuple):
     error: np.ndarray
     eigenvalue: np.ndarray
     dissolved: int | None = None
+    returns: Returns | None = None
 
 
 @dataclass
@@ -96,9 +99,11 @@ class KLT:
 
     Attributes:
         settings: How features are found and followed.
+        lost: Whether to look in every frame for features that were given up, and not only where most are new.
     """
 
     settings: KLTSettings = field(default_factory=KLTSettings)
+    lost: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         n = self.settings.capacity
@@ -107,8 +112,9 @@ class KLT:
         self._ids = np.full(n, -1, np.int64)
         self._anchor = np.full(n, -1, np.int64)
         self._anchor_pixels = np.zeros((n, 2), np.float32)
-        self._reach = self.settings.window // 2 + max(4, math.ceil(2 * self.settings.anchor_move))
-        side = 2 * self._reach + 1
+        given = self.settings
+        self._flow = Flow(given.window, given.levels, given.forward_backward, given.anchor_move)
+        side = 2 * self._flow.reach + 1
         self._patches = np.zeros((n, side, side), np.uint8)  # of the anchors, about the rounded pixel
         self._previous: np.ndarray | None = None
         self._frame = -1
@@ -119,6 +125,7 @@ class KLT:
         self._bars = Bars()
         self._overlays: Overlays | None = None
         self._dissolves, self._shot = Dissolves(), 0  # the first frame of the present shot, so far as is known
+        self._places = Places(self.settings.window / 2)
 
     def track(self, image: np.ndarray, ignore: np.ndarray | None = None) -> FrameTracks:
         """Follow all features into `image` (h, w) or (h, w, 3) uint8, and fill the free slots.
@@ -152,9 +159,10 @@ class KLT:
         fresh = np.zeros(self.settings.capacity, bool)
         if self._alive.sum() < self.settings.refill * self.settings.capacity:
             fresh = self._fill(gray)
+        returns = self._look_back(gray, fresh) if self.settings.find_places else None
         self._previous = gray
         pixels, alive, ids = self._pixels.astype(np.float64), self._alive.copy(), self._ids.copy()
-        return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue, dissolved)
+        return FrameTracks(pixels, alive, fresh, ids, error, eigenvalue, dissolved, returns)
 
     def drop(self, ids: np.ndarray) -> None:
         """Give up the features of these numbers: the filter found them to be outliers."""
@@ -190,73 +198,65 @@ class KLT:
         return self._bars.mask, self._overlays.mask
 
     def _follow(self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The flow from frame to frame, of features that stay inside; as of `_flow`.
+        """The flow from frame to frame, of features that stay inside; as of `Flow.between`.
 
         Where it loses most of them (a frame is missing, the camera is thrown about) it is sought again from where the
         image as a whole has gone, and the one that keeps more of them is taken.
         """
 
         def flow(guess: np.ndarray | None) -> tuple[np.ndarray, ...]:
-            moved, ok, *quality = self._flow(a, b, pixels, guess, self.settings.levels)
+            moved, ok, *quality = self._flow.between(a, b, pixels, guess, self.settings.levels)
             return moved, ok & self._inside(moved), *quality
 
         found = flow(None)
         if found[1].mean() < LOST:
-            again = flow(pixels + _shift(a, b))
+            again = flow(pixels + shift_between(a, b))
             found = max(found, again, key=lambda f: f[1].sum())
         return found
-
-    def _flow(
-        self, a: np.ndarray, b: np.ndarray, pixels: np.ndarray, guess: np.ndarray | None, levels: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in `b`, whether tracking there and back agrees, its distance in pixels, and the eigenvalues."""
-        s = self.settings
-        window, stop = (s.window, s.window), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, STEPS, CLOSE)
-        start = (pixels if guess is None else guess).reshape(-1, 1, 2).copy()
-        origin = pixels.reshape(-1, 1, 2)
-        # Without a guess the flow starts where the feature was, as OpenCV's default does.
-        flags = cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
-        there, ok, eigenvalue = cv2.calcOpticalFlowPyrLK(a, b, origin, start, None, None, window, levels, stop, flags)
-        if levels:  # on the way back, only as many levels as the flow of most points was long
-            length = np.linalg.norm(there - origin, axis=2)[ok == 1]
-            length = length[np.isfinite(length)]
-            windows = np.quantile(length, MOST) / (s.window / 2) if length.size else 1.0
-            levels = min(levels, math.ceil(math.log2(max(windows, 1.0))))
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, origin.copy(), None, None, window, levels, stop, flags)
-        there, back = there.reshape(-1, 2), back.reshape(-1, 2)
-        distance = np.linalg.norm(back - pixels, axis=1)
-        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (distance < s.forward_backward)
-        return there, np.asarray(good & np.isfinite(there).all(axis=1)), distance, eigenvalue.ravel()
 
     def _realign(self, gray: np.ndarray, error: np.ndarray, eigenvalue: np.ndarray) -> None:
         slots = np.flatnonzero(self._alive & (self._anchor < self._frame - 1))
         if not slots.size:
             return
-        # All patches stand side by side in one image, whatever frame they come from: one call follows them all.
-        patches, centre = _mosaic(self._patches[slots])
-        origin, guess = self._anchor_pixels[slots], self._pixels[slots]
-        present = self._cut(gray, guess)
-        now, _ = _mosaic(present)
-        place = centre + origin - np.rint(origin)
-        offset = np.rint(guess) - centre
-        moved, ok, fb, smaller = self._flow(patches, now, place, guess - offset, 0)
-        moved = moved + offset
-        ok &= np.linalg.norm(moved - guess, axis=1) < self.settings.anchor_move
+        guess = self._pixels[slots]
+        present = self._flow.patches(gray, guess)
+        moved, ok, fb, smaller = self._flow.aligned(self._patches[slots], self._anchor_pixels[slots], present, guess)
         self._pixels[slots[ok]] = moved[ok]
         error[slots[ok]], eigenvalue[slots[ok]] = fb[ok], smaller[ok]
         self._set_anchor(slots[~ok], present[~ok])
+
+    def _look_back(self, gray: np.ndarray, fresh: np.ndarray) -> Returns | None:
+        """Features that were given up and are in this frame, of the place that holds most of them; `fresh` (n,) slots.
+
+        Keeps a place where one is due. Fresh features are put where those before them are found.
+        """
+        slots = np.flatnonzero(self._alive)
+        due = self._places.due(self._ids[slots])
+        if not (due or self.lost) or not slots.size:
+            return None
+        pixels = self._pixels[slots]
+        present = self._flow.patches(gray, pixels)
+        here = self._places.place(self._frame, gray, self._ids[slots], pixels, present)
+        found = self._places.find(here)
+        if due:
+            self._places.keep(here)
+        if found is None:
+            return None
+        place, now, before = found
+        moved, ok, *_ = self._flow.aligned(place.patches[before], place.pixels[before], present[now], pixels[now])
+        if ok.sum() < FEWEST:
+            return None
+        moved, now, before = moved[ok], now[ok], before[ok]
+        new = fresh[slots[now]]
+        at = slots[now[new]]
+        self._pixels[at] = moved[new]
+        self._set_anchor(at, self._flow.patches(gray, moved[new]))
+        return Returns(here.ids[now], place.ids[before], moved.astype(np.float64), place.frame)
 
     def _set_anchor(self, slots: np.ndarray, patches: np.ndarray) -> None:
         self._anchor[slots] = self._frame
         self._anchor_pixels[slots] = self._pixels[slots]
         self._patches[slots] = patches
-
-    def _cut(self, gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Patches about the rounded pixels (n, 2): (n, side, side)."""
-        r = self._reach
-        padded = cv2.copyMakeBorder(gray, r, r, r, r, cv2.BORDER_REFLECT_101)
-        x, y = np.rint(pixels).astype(int).T
-        return np.lib.stride_tricks.sliding_window_view(padded, (2 * r + 1, 2 * r + 1))[y, x]
 
     def _inside(self, pixels: np.ndarray) -> np.ndarray:
         assert self._shape is not None
@@ -317,7 +317,7 @@ class KLT:
         self._alive[slots] = True
         self._ids[slots] = np.arange(self._next_id, self._next_id + slots.size)
         self._next_id += slots.size
-        self._set_anchor(slots, self._cut(gray, corners))
+        self._set_anchor(slots, self._flow.patches(gray, corners))
         fresh[slots] = True
         return fresh
 
@@ -336,31 +336,3 @@ class KLT:
         for c in np.unique(cells):  # corners come in order of strength
             rank[cells == c] = held[c] + np.arange((cells == c).sum())
         return np.argsort(rank, kind="stable")
-
-
-def _mosaic(patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Patches (n, side, side) side by side in one image, and the pixel (n, 2) of the centre of each."""
-    n, side = patches.shape[:2]
-    columns = math.ceil(math.sqrt(n))
-    rows = math.ceil(n / columns)
-    tiles = np.zeros((rows * columns, side, side), np.uint8)
-    tiles[:n] = patches
-    row, column = np.divmod(np.arange(n), columns)
-    centre = np.stack([column, row], axis=1).astype(np.float32) * side + side // 2
-    image = tiles.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, columns * side)
-    return image, centre
-
-
-def _shift(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """By how many pixels (x, y) the image has moved from `a` to `b`: that of the part that is found again best."""
-    scale = COARSE / max(a.shape)
-    small, other = (cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for x in (a, b))
-    h, w = (n // TILES for n in small.shape[:2])
-    best, shift = 0.0, np.zeros(2)
-    for y, x in np.ndindex(TILES, TILES):
-        tile = small[y * h : (y + 1) * h, x * w : (x + 1) * w]
-        if tile.std() > FLAT:
-            _, score, _, at = cv2.minMaxLoc(cv2.matchTemplate(other, tile, cv2.TM_CCOEFF_NORMED))
-            if score > best:
-                best, shift = score, np.array([at[0] - x * w, at[1] - y * h]) / scale
-    return shift.astype(np.float32)

@@ -4,8 +4,7 @@ from tracks import make, sideways
 
 from jaxtri.errors import InitialisationError, InputError
 from jaxtri.estimation import batch
-from jaxtri.odometry import adjustment, stretches
-from jaxtri.odometry import refine as module
+from jaxtri.odometry import adjusted, adjustment, stretches
 from jaxtri.odometry.driver import Odometry
 from jaxtri.odometry.refine import refine
 from jaxtri.odometry.run import follow_tracks
@@ -67,11 +66,11 @@ def test_refined_poses_are_nearer_and_the_rest_stays(run):
 def test_looks_at_what_moves_by_itself_are_left_out(run):
     _, odometry = run
     first, moved = odometry.base_pair[0], odometry.base_pair[0] + 20
-    before, whole = odometry.tracks[moved], stretches.Segment.of(odometry, first, 40)
+    before, whole = odometry.tracks[moved], stretches.Segment.of(odometry, np.arange(first, 40))
     lone = np.arange(len(before.visible)) % 5 == 0
     odometry.tracks[moved] = before._replace(moving=lone)
     try:
-        without = stretches.Segment.of(odometry, first, 40)
+        without = stretches.Segment.of(odometry, np.arange(first, 40))
     finally:
         odometry.tracks[moved] = before
     expected = whole.seen.copy()
@@ -82,7 +81,7 @@ def test_looks_at_what_moves_by_itself_are_left_out(run):
 
 def test_a_keyframe_comes_where_half_of_the_tracks_are_gone(run):
     _, odometry = run
-    settings, whole = odometry.settings, stretches.Segment.of(odometry, odometry.base_pair[0], 40)
+    settings, whole = odometry.settings, stretches.Segment.of(odometry, np.arange(odometry.base_pair[0], 40))
     # All but what hardly moves ends one frame after each third: what is left would make no keyframe for long.
     shift = np.linalg.norm(whole.u[-1] - whole.u[0], axis=1)
     lasting = np.argsort(np.where(whole.seen.all(axis=0), shift, np.inf))[: int(settings.keyframe_common) + 10]
@@ -145,7 +144,7 @@ def test_long_sequences_are_cut_into_blocks(run, monkeypatch):
 
 def test_another_sequence_compiles_nothing(run):
     """Other frames, keyframes, tracks and looks: what one refinement has compiled serves the next one."""
-    programs = batch.normal_equations, batch._stepped, batch._known, adjustment._begun, module._measured
+    programs = batch.normal_equations, batch._stepped, batch._known, adjustment._begun, adjusted._measured
     first = refine(run[1])
     compiled = [program._cache_size() for program in programs]
     assert all(compiled)

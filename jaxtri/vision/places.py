@@ -1,0 +1,124 @@
+"""Places that were seen before: the features of some frames are described, and found again in later ones.
+
+A place is a frame whose features are kept, with a descriptor and the patch of each. One is kept whenever more than half
+of the features of the last one are gone, and is looked for among the others then. The descriptor is SIFT at the feature
+itself (Lowe 2004, section 6), upright, its roots compared (Arandjelovic & Zisserman 2012). Two features are one where
+each is the other's best match by a margin; whether their patches are one is for the flow to say.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+GONE = 0.5  # share of a place's features that are left, below which the next place is kept
+LEFT = 0.1  # share of them that are still followed, from which the place has not been left
+MARGIN = 0.8  # largest distance to the best match over that to the second best. Source: Lowe 2004, section 7.1
+MOST = 256  # places that are kept; where there are more, every other one of the older half is forgotten
+FEWEST = 12  # matches that are worth to be looked at
+FIRST_LOOK = 128  # features by which the places that are worth to be matched with all are found
+LIKELY = 4  # places that are
+
+
+class Place(NamedTuple):
+    """The features of a frame.
+
+    Attributes:
+        frame: Its number.
+        ids: (n,) numbers of the features.
+        pixels: (n, 2) where they are.
+        descriptors: (n, 128) roots of SIFT, of unit length.
+        patches: (n, side, side) about the rounded pixels.
+    """
+
+    frame: int
+    ids: np.ndarray
+    pixels: np.ndarray
+    descriptors: np.ndarray
+    patches: np.ndarray
+
+
+class Returns(NamedTuple):
+    """Features that were given up, and are seen again under other numbers.
+
+    Attributes:
+        now: (m,) numbers of the features of this frame.
+        before: (m,) numbers that they had.
+        pixels: (m, 2) where those are in this frame, by their own patches: up to a pixel or two from the new ones, but
+            for fresh ones, which are put there.
+        frame: One of before that holds all of them.
+    """
+
+    now: np.ndarray
+    before: np.ndarray
+    pixels: np.ndarray
+    frame: int
+
+
+class Matches(NamedTuple):
+    """Features of a frame that may be some of a place: rows of both."""
+
+    place: Place
+    now: np.ndarray
+    before: np.ndarray
+
+
+@dataclass
+class Places:
+    """The places of a sequence.
+
+    Attributes:
+        size: Of a feature, in pixels: its descriptor is six times as wide.
+        kept: Those that are kept, in order.
+    """
+
+    size: float
+    kept: list[Place] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._sift = cv2.SIFT.create()
+
+    def due(self, ids: np.ndarray) -> bool:
+        """Whether too little is left of the last place, for features of these numbers (n,)."""
+        if not self.kept:
+            return len(ids) >= FEWEST
+        last = self.kept[-1].ids
+        return len(ids) >= FEWEST and int(np.isin(last, ids).sum()) < GONE * len(last)
+
+    def place(self, frame: int, gray: np.ndarray, ids: np.ndarray, pixels: np.ndarray, patches: np.ndarray) -> Place:
+        """The features of a frame, described."""
+        points = [cv2.KeyPoint(float(x), float(y), self.size, 0.0) for x, y in pixels]
+        _, found = self._sift.compute(gray, points)
+        roots = np.sqrt(found / np.maximum(np.abs(found).sum(axis=1, keepdims=True), 1.0))
+        return Place(frame, ids, pixels.astype(np.float32), roots.astype(np.float16), patches)
+
+    def keep(self, place: Place) -> None:
+        """One more."""
+        self.kept.append(place)
+        if len(self.kept) > MOST:
+            half = MOST // 2
+            self.kept = self.kept[:half:2] + self.kept[half:]
+
+    def find(self, now: Place) -> Matches | None:
+        """The place, of those that have been left, that most features may be of; None where none is likely."""
+        others = [p for p in self.kept if np.isin(p.ids, now.ids).sum() < LEFT * len(p.ids)]
+        if len(others) > LIKELY:
+            some = np.linspace(0, len(now.ids) - 1, min(FIRST_LOOK, len(now.ids))).astype(int)
+            few = now._replace(ids=now.ids[some], descriptors=now.descriptors[some])
+            others = sorted(others, key=lambda p: len(_matched(few, p)[0]))[-LIKELY:]
+        found = [Matches(p, *_matched(now, p)) for p in others]
+        best = max(found, key=lambda m: len(m.now), default=None)
+        return None if best is None or len(best.now) < FEWEST else best
+
+
+def _matched(now: Place, place: Place) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of either that are each other's best match by a margin."""
+    like = now.descriptors.astype(np.float32) @ place.descriptors.astype(np.float32).T
+    if min(like.shape) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
+    distance = np.sqrt(np.maximum(2 - 2 * like, 0.0))
+    before, rows = np.argmin(distance, axis=1), np.arange(len(distance))
+    best, second = np.partition(distance, 1, axis=1)[:, :2].T
+    mutual = (np.argmin(distance, axis=0)[before] == rows) & (best < MARGIN * second)
+    return rows[mutual], before[mutual]
