@@ -25,13 +25,14 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from contract import parser, report, table
+from scipy.spatial.transform import Rotation
 
 jax.config.update("jax_enable_x64", True)
 
@@ -47,7 +48,7 @@ from jaxtri.trajectory import Trajectory, align, evaluate  # noqa: E402
 from jaxtri.vision.video import Frame  # noqa: E402
 
 WRONG = 39.49  # chi-square of six degrees of freedom that is as rare as five standard deviations of one
-SURE = (Status.TRACKING, Status.RESTARTED)
+SURE = (Status.TRACKING, Status.RESTARTED, Status.FOUND)
 FEWEST = 8  # frames of a piece that has an error
 SITUATIONS: dict[str, tuple[Callable[[int, int], scenes.Situation], int]] = {
     "highway_empty": (scenes.highway_empty, 150),
@@ -69,8 +70,9 @@ SITUATIONS: dict[str, tuple[Callable[[int, int], scenes.Situation], int]] = {
 DRAWN = ("highway_empty", "highway_traffic", "highway_light")  # several times
 QUICK = {"highway_traffic": 60, "other_room_cut": 80}
 LONG = 10_000
-COUNTS = ("confidently_wrong", "judged", "false_cuts", "missed_cuts")
+COUNTS = ("confidently_wrong", "judged", "false_cuts", "missed_cuts", "loops", "false_matches")
 HAND = 9  # frames around the middle that show some of the hand
+FALSE, COUNTS_FROM = 2.0, 0.25  # degrees by which a place is another one, and weight from which one counts
 
 
 class Judged(NamedTuple):
@@ -108,7 +110,6 @@ class Said(NamedTuple):
         causal: What the filter said.
         refined: What all frames together say.
         figures: Of this run, by name; those that are counts are added up over runs.
-        unknown: Frame from which the scale is a guess.
         warned: First words of what was warned of.
         shown: A frame.
         seconds: Of rendering, tracking and refinement.
@@ -119,17 +120,15 @@ class Said(NamedTuple):
     causal: Judged
     refined: Judged
     figures: dict[str, float]
-    unknown: int | None
     warned: list[str]
     shown: np.ndarray
     seconds: float
 
 
-def pieces(poses: list[FramePose], unknown: int | None) -> list[np.ndarray]:
-    """Frames with a pose, split where a new scale begins."""
-    starts = [k for k, p in enumerate(poses) if p.status is Status.RESTARTED and k >= (unknown or 0)]
-    posed = np.array([p.T_camera_world is not None for p in poses])
-    return [p[posed[p]] for p in np.split(np.arange(len(poses)), starts) if posed[p].any()]
+def pieces(poses: list[FramePose]) -> list[np.ndarray]:
+    """Frames with a pose, those of each scale."""
+    starts = np.array([-1 if p.T_camera_world is None else p.start for p in poses])
+    return [np.flatnonzero(starts == k) for k in np.unique(starts[starts >= 0])]
 
 
 def world_camera(poses: list[FramePose], frames: np.ndarray) -> np.ndarray:
@@ -166,7 +165,7 @@ def judge(run: Run, poses: list[FramePose], truth: np.ndarray) -> Judged:
     """What the sure frames of a run are worth, piece by piece."""
     worst, frames, squares = float("nan"), [], []
     sure = np.array([p.status in SURE for p in poses])
-    for piece in pieces(poses, run.odometry.scale_unknown_from):
+    for piece in pieces(poses):
         kept = piece[sure[piece]]
         if len(kept) >= FEWEST:
             found = Trajectory(kept / scenes.FPS, world_camera(poses, kept))
@@ -193,6 +192,21 @@ def scale_step(poses: list[FramePose], middle: int, truth: np.ndarray) -> float:
         for k in (sure[sure < middle - HAND], sure[sure >= middle + HAND])
     ]
     return scales[1] / scales[0] - 1
+
+
+def counted(run: Run) -> list[dict]:
+    """Places that are seen again and count, as `run.json` has them."""
+    assert run.refined is not None
+    parts: Any = run.refined.statistics["parts"]
+    return [loop for part in parts for loop in part.get("loops", ()) if loop["weight"] > COUNTS_FROM]
+
+
+def revisited(poses: list[FramePose], truth: np.ndarray, frame: int, place: int) -> float:
+    """By how many degrees the turn between two frames is off."""
+    found, true = (
+        T[1, :3, :3].T @ T[0, :3, :3] for T in (world_camera(poses, np.array([frame, place])), truth[[frame, place]])
+    )
+    return float(np.degrees(np.linalg.norm(Rotation.from_matrix(found.T @ true).as_rotvec())))
 
 
 def end_error(poses: list[FramePose], truth: np.ndarray) -> float:
@@ -239,8 +253,13 @@ def follow(name: str, situation: scenes.Situation) -> Said:
             found[f"{kind}scale_error"] = scale_step(x.poses, len(truth) // 2, truth)
         if name == "room_twice":
             found[f"{kind}end_error_percent"] = end_error(x.poses, truth)
+    if name == "hand":
+        back = [again.frame - len(truth) // 2 - HAND + 1 for again in run.odometry.found]
+        found["found_after_frames"] = back[0] if back else float("nan")
+    turns = [revisited(refined.poses, truth, loop["frame"], loop["place"]) for loop in counted(run)]
+    found |= {"loops": len(turns), "false_matches": sum(turn > FALSE for turn in turns)}
     words = [" ".join(str(w.message).split()[:6]) for w in said]
-    return Said(name, truth, causal, refined, found, unknown, words, shown[0], time.perf_counter() - begun)
+    return Said(name, truth, causal, refined, found, words, shown[0], time.perf_counter() - begun)
 
 
 def together(runs: list[Said]) -> dict[str, float]:
@@ -294,7 +313,7 @@ def plot_paths(done: dict[str, list[Said]], path: Path) -> None:
         said = runs[0]
         axis.plot(*said.true[:, (0, 2), 3].T, "k.", ms=1.5, label="true")
         for kind, x, colour in (("causal", said.causal, "C0"), ("refined", said.refined, "C1")):
-            for number, piece in enumerate(np.intersect1d(p, x.frames) for p in pieces(x.poses, said.unknown)):
+            for number, piece in enumerate(np.intersect1d(p, x.frames) for p in pieces(x.poses)):
                 if len(piece) < FEWEST:
                     continue
                 place = world_camera(x.poses, piece)[:, :3, 3]
@@ -346,9 +365,12 @@ def main() -> None:
         "highway_traffic.over_empty",
         "highway_traffic.worst_ate_percent",
         "hand.scale_error",
+        "hand.found_after_frames",
         "room_twice.end_error_percent",
+        "room_twice.refined_end_error_percent",
     )
     print("\n" + "\n".join(f"{k} {figures[k]:.3f}" for k in asked if np.isfinite(figures.get(k, np.nan))))
+    print(f"places seen again: {figures['loops']:.0f}, of which {figures['false_matches']:.0f} are none")
     print(f"called tracking and wrong: {figures['confidently_wrong']:.0f} of {figures['judged']:.0f} frames")
     if args.plots:
         plot_frames(done, args.plots / "footage_frames.png")

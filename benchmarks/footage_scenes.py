@@ -221,7 +221,9 @@ def hand(n: int, seed: int) -> Situation:
         return image * (1 - alpha) + over * alpha
 
     images = film(room(seed), camera, T, seed, put)
-    return Situation(camera, images, T, "ten frames not tracking, the scale kept or called unknown", shown=first - 2)
+    return Situation(
+        camera, images, T, "ten frames not tracking, then found again at the scale of before", shown=first - 2
+    )
 
 
 def room_twice(n: int, seed: int) -> Situation:

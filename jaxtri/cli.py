@@ -26,6 +26,7 @@ FileOption = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(def
 Rate = Annotated[float | None, arg(metavar="RATE", help_behavior_hint="(default: the source's times)")]
 Frames = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")]
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # without its --no- form: it is off by default
+On = Annotated[Switch, arg(help_behavior_hint="")]  # its --no- form alone
 
 
 # The groups of `jaxtri track --help`. They have no docstrings: help would repeat them.
@@ -69,16 +70,16 @@ class _Filter:
     """Base frames: tracks, inherit or paper."""
     overlap: Annotated[int, arg(metavar="N")] = 1
     """Frames that two segments share (--base paper)."""
-    refine: bool = True
-    """Adjust all keyframes together at the end of a file."""
-    loops: bool = True
-    """Find places again after a loss, and close loops."""
+    refine: On = True
+    """Do not adjust all keyframes together at the end of a file."""
+    loops: On = True
+    """Do not find places again after a loss, nor close loops."""
 
 
 @dataclass
 class _Output:
-    overlay: bool = True
-    """Write overlay.mp4."""
+    overlay: On = True
+    """Write no overlay.mp4."""
     place: Annotated[tuple[float, float] | None, arg(metavar="U V", help_behavior_hint="(default: on a plane)")] = None
     """Pixel of the middle frame where the car stands."""
     recording: Switch = False
@@ -389,8 +390,7 @@ def _demo(options: Demo) -> None:
     print(f"rendering {options.frames} frames of a laboratory, the camera sliding sideways before some boxes")
     said = asdict(options) | {"out": str(options.out)}
     done = demo(options.out, said, frames=options.frames, seed=options.seed, progress=not options.quiet)
-    print(run_text(done.run, done.paths))
-    print(f"errors against the truth, in metres:\n{errors_text(done.errors)}")
+    print(run_text(done.run, done.paths), "errors against the truth, in metres:", errors_text(done.errors), sep="\n")
     print(
         f"look at {options.out / 'trajectory.png'} and {options.out / 'overlay.mp4'}; the frames are in {done.frames}"
     )

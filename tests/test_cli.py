@@ -242,7 +242,8 @@ def test_the_help_of_track_fits_on_a_screen_and_settings_are_flat(monkeypatch, c
     assert len(said.splitlines()) <= 55
     names = set(Track("a").flat()) - {"source"}
     assert {"camera", "fov", "noise_px", "base", "refine", "place", "strict"} <= names
-    assert all(f"--{name.replace('_', '-')}" in said for name in names)
+    names = {name.replace("_", "-") for name in names}
+    assert all(f"--{name} " in said or f"--no-{name} " in said or f"--{name}, " in said for name in names)
     assert "(default: 0.4)" in said
     assert said.index("--camera") < said.index("--max-frames") < said.index("tracker") < said.index("--noise-px")
 
