@@ -20,8 +20,9 @@ klt, start = KLTSettings(capacity=120), StartSettings(lag=4)
 warm_up(camera, klt=klt, start=start)  # compiles: no frame should wait for it
 features, odometry = KLT(klt), Odometry(camera, start=start, capacity=klt.capacity)
 for time, image in frames:
+    features.lost = odometry.lost  # then it looks in every frame for what was there before
     tracks = features.track(image)
-    outliers = odometry.add(tracks.pixels, tracks.visible, time, ids=tracks.ids)
+    outliers = odometry.add(tracks.pixels, tracks.visible, time, ids=tracks.ids, returns=tracks.returns)
     features.drop(tracks.ids[outliers])
     latest = odometry.latest  # `lag` frames behind while a start is worked out
     if latest is None or latest.T_camera_world is None:

@@ -52,6 +52,7 @@ from jaxtri.models.baselines.two_step import TwoStep
 from jaxtri.models.depth import Bank, Depth
 from jaxtri.models.motion import Kinematics, Twist
 from jaxtri.models.point_noise import PointNoise
+from jaxtri.models.rolling_shutter import LatePoint, RollingShutter
 from jaxtri.models.trifocal import Trifocal, TrifocalState
 from jaxtri.odometry import replay, single_pair, track_pairs
 from jaxtri.odometry.replay import Recording
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
     from jaxtri.output.plot import plot_trajectory
     from jaxtri.output.results import write_overlay, write_results
     from jaxtri.vision.klt import KLT, KLTSettings
+    from jaxtri.vision.places import Returns
     from jaxtri.vision.survey import Survey, survey
     from jaxtri.vision.video import open_source
 
@@ -83,6 +85,7 @@ _LATER = {
     "Odometry": "jaxtri.odometry.driver",
     "Points": "jaxtri.odometry.structure",
     "Refinement": "jaxtri.odometry.refine",
+    "Returns": "jaxtri.vision.places",
     "Run": "jaxtri.odometry.run",
     "Survey": "jaxtri.vision.survey",
     "calibrate": "jaxtri.odometry.calibrate",
@@ -144,6 +147,7 @@ __all__ = [
     "JaxtriError",
     "KLTSettings",
     "Kinematics",
+    "LatePoint",
     "Odometry",
     "PointNoise",
     "Points",
@@ -151,7 +155,9 @@ __all__ = [
     "Refinement",
     "Report",
     "ResolutionChangeError",
+    "Returns",
     "Robust",
+    "RollingShutter",
     "Run",
     "Settings",
     "SourceWarning",

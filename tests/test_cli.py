@@ -9,7 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxtri.cli import Track, main
+from jaxtri.cli import main
+from jaxtri.cli.options import Track
 from jaxtri.formats import read_camera, read_tum
 from jaxtri.synthetic.rendered import write_laboratory
 from jaxtri.trajectory import evaluate

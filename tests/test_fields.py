@@ -17,6 +17,7 @@ NOISES = 1e-3, 0.01, 0.02
 MODELS = [
     jaxtri.BaseFrames(*NOISES),
     jaxtri.BasePairs(*NOISES),
+    jaxtri.RollingShutter(*NOISES),
     jaxtri.Depth(1e-3, 1e-3, 0, jnp.inf),
     KnownStructure(*NOISES),
     jaxtri.StructureAndMotion(*NOISES),

@@ -66,6 +66,7 @@ def write_camera(path: PathLike, camera: Camera) -> None:
         "width": camera.width,
         "height": camera.height,
         "distortion": [0.0] * 5 if lens is None else np.asarray(lens.coefficients, np.float64),
+        "readout": None if camera.readout is None else np.asarray(camera.readout, np.float64),
     }
     write_json(path, {name: value for name, value in entries.items() if value is not None})
 

@@ -25,6 +25,7 @@ class Intrinsics:
         coefficients: Of the lens, in its own order.
         width: Of the image in pixels, None where it is not said.
         height: Of the image in pixels, None where it is not said.
+        readout: Seconds of a shutter that rolls: of the rows, or of the columns and the rows.
     """
 
     fx: float
@@ -36,6 +37,7 @@ class Intrinsics:
     coefficients: tuple[float, ...] = ()
     width: int | None = None
     height: int | None = None
+    readout: tuple[float, ...] = ()
 
     def from_corner(self) -> "Intrinsics":
         """The same of a file that counts from the corner of the first pixel, whose centre is at one half."""
@@ -47,7 +49,9 @@ class Intrinsics:
         lens = None if self.lens is BrownConrady and not any(self.coefficients) else self.lens
         distortion = None if lens is None else lens.from_coefficients(self.coefficients)
         size = {"width": self.width, "height": self.height}
-        return Camera.from_parameters(self.fx, self.fy, self.cx, self.cy, skew=self.skew, distortion=distortion, **size)
+        centre, lens = (self.cx, self.cy), {"skew": self.skew, "distortion": distortion}
+        camera = Camera.from_parameters(self.fx, self.fy, *centre, **lens, **size)  # pyright: ignore[reportArgumentType]
+        return camera.rolling(*(0.0, *self.readout)[-2:]) if self.readout else camera
 
 
 # By the quantity: the names that files and tools have for it.
@@ -189,7 +193,11 @@ def read_intrinsics(entries: Entries, *, model: Sequence[str] = (), size: Size |
         (xi,) = coefficients
         fx, fy, coefficients = fx / (1 + xi), fy / (1 + xi), [xi / (1 + xi), 1.0]
     _whole_sensor(entries)
-    return Intrinsics(fx, fy, cx, cy, skew, lens or BrownConrady, tuple(coefficients), *(size or read_size(entries)))
+    readout = tuple(entries.numbers("readout") or ())
+    if len(readout) > 2:
+        raise CameraError(f"readout is {list(readout)}; expected the seconds of the rows, or of columns and rows")
+    kind = lens or BrownConrady, tuple(coefficients)
+    return Intrinsics(fx, fy, cx, cy, skew, *kind, *(size or read_size(entries)), readout)
 
 
 def from_matrix(name: str, values: Sequence[float]) -> tuple[float, float, float, float, float]:

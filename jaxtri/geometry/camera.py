@@ -15,12 +15,14 @@ from jaxtri.errors import CameraError
 from jaxtri.geometry.lenses import Lens, turned
 from jaxtri.geometry.undistortion import undistort
 
+SLOWEST = 0.5  # seconds: what takes longer to be read was given in milliseconds
+
 
 class Camera(eqx.Module):
     """A pinhole camera with an optional lens distortion; every intrinsic may be differentiated.
 
     u = fx x + skew y + cx, v = fy y + cy, for a normalised (and then distorted) point (x, y). The centre of the
-    top-left pixel is (0, 0). Every field but the last two is a leaf.
+    top-left pixel is (0, 0). Every field but the two of the size is a leaf.
 
     Attributes:
         fx: Focal length along the rows of the image, pixels.
@@ -31,6 +33,8 @@ class Camera(eqx.Module):
         distortion: Distortion of the lens, None for a pinhole.
         width: Width of the image in pixels, None where it is not known (static).
         height: Height of the image in pixels, None where it is not known (static).
+        readout: (2,) seconds from the exposure of the first column to that of the last, and from that of the first row
+            to that of the last, of a shutter that rolls; None of one that exposes all at once.
     """
 
     fx: Float[Array, ""] = eqx.field(converter=number)
@@ -41,6 +45,7 @@ class Camera(eqx.Module):
     distortion: Lens | None = None
     width: int | None = eqx.field(static=True, default=None)
     height: int | None = eqx.field(static=True, default=None)
+    readout: Float[Array, "2"] | None = None
 
     def __check_init__(self) -> None:
         """Raise `CameraError` naming what is not finite, or not positive where it must be; where there are values."""
@@ -52,6 +57,9 @@ class Camera(eqx.Module):
             value = concrete(getattr(self, name))
             if value is not None and not (value > 0).all():
                 raise CameraError(f"{name} is {value}; it must be a positive number of pixels")
+        readout = None if self.readout is None else concrete(self.readout)
+        if readout is not None and not (np.isfinite(readout).all() and (np.abs(readout) < SLOWEST).all()):
+            raise CameraError(f"readout is {readout}; it is in seconds, of some 0.005 to 0.03")
         coefficients = None if self.distortion is None else concrete(self.distortion.coefficients)
         if coefficients is not None and not np.isfinite(coefficients).all():
             raise CameraError(f"distortion is {coefficients}; its coefficients must be finite")
@@ -68,15 +76,17 @@ class Camera(eqx.Module):
         distortion: Lens | None = None,
         width: int | None = None,
         height: int | None = None,
+        readout: float | None = None,
         dtype: Any = None,
     ) -> "Camera":
-        """A camera from numbers; `dtype` defaults to JAX's default float.
+        """A camera from numbers; `dtype` defaults to JAX's default float. `readout` is that of the rows, in seconds.
 
         Raises `CameraError` naming the parameter that is not finite, or not positive where it must be.
         """
         dtype = jnp.result_type(float) if dtype is None else dtype
         fx_, fy_, cx_, cy_, skew_ = jnp.asarray([fx, fy, cx, cy, skew], dtype)
-        return cls(fx_, fy_, cx_, cy_, skew_, distortion, width, height).astype(dtype)
+        rolls = None if readout is None else jnp.asarray([0.0, readout], dtype)
+        return cls(fx_, fy_, cx_, cy_, skew_, distortion, width, height, rolls).astype(dtype)
 
     @classmethod
     def from_fov(cls, fov_deg: float, width: int, height: int, dtype: Any = None) -> "Camera":
@@ -150,8 +160,25 @@ class Camera(eqx.Module):
                 distortion=None if camera.distortion is None else turned(camera.distortion),
                 width=camera.height,
                 height=camera.width,
+                readout=None if camera.readout is None else jnp.stack([-camera.readout[1], camera.readout[0]]),
             )
         return camera
+
+    def rolling(self, columns_s: float, rows_s: float) -> "Camera":
+        """The camera with a shutter that reads its columns, or its rows, within so many seconds: `readout`."""
+        return dataclasses.replace(self, readout=jnp.asarray([columns_s, rows_s], self.fx.dtype))
+
+    def late(self, pixels: Float[Array, "*batch 2"]) -> Float[Array, " *batch"]:
+        """Seconds from the exposure of the middle of the picture to that of pixels.
+
+        Raises `CameraError` where the size of the picture is not known; zero without a `readout`.
+        """
+        if self.readout is None:
+            return jnp.zeros_like(pixels[..., 0])
+        if self.width is None or self.height is None:
+            raise CameraError("a shutter that rolls goes over the picture, whose size is not known: set it")
+        share = (pixels + 0.5) / jnp.asarray([self.width, self.height], pixels.dtype) - 0.5
+        return share @ self.readout
 
     @property
     def magnification(self) -> Float[Array, ""] | float:

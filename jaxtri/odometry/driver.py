@@ -19,7 +19,7 @@ from jaxtri.geometry.zoom_curve import ZoomCurve, camera_at
 from jaxtri.odometry.beginning import Before, Begun, begin
 from jaxtri.odometry.beside import beside
 from jaxtri.odometry.followers import Follower
-from jaxtri.odometry.observing import Rows, observed
+from jaxtri.odometry.observing import Rows, at_frame_times, observed
 from jaxtri.odometry.places import Found, Places, mark_apart
 from jaxtri.odometry.poses import FramePose, trajectory
 from jaxtri.odometry.recorder import Recorder
@@ -147,9 +147,11 @@ class Odometry(Archived):
         index = len(self.poses)
         rows, before = Rows.of(pixels, visible, ids, quality, returns), self.poses[-1].time if index else None
         held = np.full(self.capacity or capacity(len(rows.ids)), -1) if self._held is None else self._held
-        frame, tracks = observed(index, time, before, rows, held, self.camera_at(time), self._settings.sigma.dtype)
+        unit = self.frame_time or (1.0 if before is None else time - before)
+        camera, dtype = self.camera_at(time), self._settings.sigma.dtype
+        frame, tracks = observed(index, time, before, rows, held, camera, unit, dtype)
         if self.frame_time is None and before is not None:
-            self.frame_time = frame.time - before
+            self.frame_time, self._waiting = unit, [f.in_frames(unit) for f in self._waiting]
         self._held, self.capacity = tracks.ids, len(held)
         self._recorder.take(tracks, rows.returns)
         lost = self.starts > 0 and self._follower is None  # else it only waits for its turn
@@ -238,12 +240,14 @@ class Odometry(Archived):
     def recording(self) -> Recording:
         """The tracks and base pairs so far, up to where the camera is lost, for `jaxtri.replay`.
 
-        Raises `InputError` where `record` is off or the camera zooms, `InitialisationError` where there is no start.
+        Raises `InputError` where `record` is off, or the camera zooms or rolls; `InitialisationError` without a start.
         """
         if not self.record:
             raise InputError("nothing was recorded: ask for it by record=True")
-        if self.zoom is not None:
-            raise InputError("the camera zooms, and a replay takes one focal length: give a part where it does not")
+        if self.zoom is not None or self.camera.readout is not None:
+            raise InputError(
+                "the camera zooms, or its shutter rolls: a replay takes one focal length and one time a frame"
+            )
         self.finish()
         if not self._recorder.pairs:
             raise InitialisationError(f"no camera motion was found in {len(self.poses)} frames: {self.reason}")
@@ -253,8 +257,8 @@ class Odometry(Archived):
 
     @property
     def tracks(self) -> list[Slotted]:
-        """The tracks of all frames so far, where `record` is on."""
-        return self._recorder.tracks
+        """The tracks of all frames so far, where `record` is on; a rolling shutter is taken out of them."""
+        return self._recorder.steady(self.camera, self.frame_time or 1.0)
 
     @property
     def returns(self) -> dict[int, Returns]:
@@ -262,9 +266,8 @@ class Odometry(Archived):
         return self._recorder.returns
 
     def _dt(self, index: int) -> float:
-        if index == 0 or not self.frame_time:
-            return 1.0
-        return (self.poses[index].time - self.poses[index - 1].time) / self.frame_time
+        passed = self.poses[index].time - self.poses[index - 1].time
+        return passed / self.frame_time if index and self.frame_time else 1.0
 
     def _take_in(self, newest: float, most: float) -> np.ndarray:
         """Up to `most` queued frames, in order, but none before a start is there; the numbers of tracks to give up."""
@@ -351,12 +354,10 @@ class Odometry(Archived):
 
         Other frames are queued meanwhile, so it only reads, and only what they do not change.
         """
-        before = None
-        if self.starts:
-            held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None][-1]
-            before = Before(held, self._depth, self.starts)
+        held = [p.T_camera_world for p in self.poses if p.T_camera_world is not None]
+        before = Before(held[-1], self._depth, self.starts) if self.starts else None
         assert isinstance(self.base, Base)
-        waiting, passed = self._waiting, self._passed
+        passed, waiting = (at_frame_times(frames) for frames in (self._passed, self._waiting))
         return begin(self._settings, self._start, self.base, waiting, passed, self._dt, before)
 
     def _find_again(self, frame: Observations) -> bool:
@@ -370,9 +371,8 @@ class Odometry(Archived):
         since = mark_apart(self.poses[: frame.index], place.start, frame.index)
         if self.scale_unknown_from is not None and self.scale_unknown_from >= since:
             self.scale_unknown_from = None
-        pose = replace(FramePose.of(frame.time, report, place.start), status=Status.FOUND)
-        self.poses[frame.index] = pose
-        self.found.append(Found(frame.index, place.frame, since, pose.used))
+        self.poses[frame.index] = replace(FramePose.of(frame.time, report, place.start), status=Status.FOUND)
+        self.found.append(Found(frame.index, place.frame, since, int(report.diagnostics.used)))
         self._follower, self._world = follower, place.start
         self._search, self._seeking = None, False
         self._waiting, self._passed, self._tried = [], [], (-1, 0.0)

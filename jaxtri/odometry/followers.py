@@ -81,7 +81,10 @@ class TrackPairs:
         self.structure.end(self._points(), over & self._good(), self.known)
         self.known = np.where(frame.visible, frame.ids, -1)
         self.state, report = step_tracks(
-            self.settings, self.state, frame.u, frame.visible, fresh, dt, hold=np.False_, quality=frame.quality
+            *(self.settings, self.state, frame.u, frame.visible, fresh, dt),
+            hold=np.False_,
+            quality=frame.quality,
+            late=frame.late,
         )
         self.keyframes += int(report.keyframe)
         return report

@@ -231,10 +231,10 @@ class Search:
         zoom, none = np.exp(np.r_[0.0, self._x[self._p :]]), np.zeros(len(self._at))
         curve = ZoomCurve(self._times, zoom, none)
         dtype, layers = self.segment.u.dtype, []
-        u = np.zeros((len(self.keys), *self.segment.u.shape[1:]), dtype)
+        u, tracks = np.zeros((len(self.keys), *self.segment.u.shape[1:]), dtype), self.odometry.tracks
         for k, frame in enumerate(self.segment.frames[self.keys]):
             seen_by = curve.camera(camera, self.odometry.poses[frame].time)
-            u[k] = np.asarray(normalise(seen_by, self.odometry.tracks[frame].pixels.astype(dtype)))
+            u[k] = np.asarray(normalise(seen_by, tracks[frame].pixels.astype(dtype)))
         pieces = self.begun.pieces
         for layer, observed, (_, mask, *_) in zip(
             self.begun.problem.layers, pieces.observed(u), pieces.layers, strict=True
@@ -252,11 +252,12 @@ class Search:
         pieces = self.begun.pieces
         score = pieces.each(scores, (size,))
         count = np.bincount(pieces.piece)
-        at = self.odometry.tracks[self.segment.frames[0]].pixels  # the size of the picture, where it is not known
+        tracks = self.odometry.tracks
+        at = tracks[self.segment.frames[0]].pixels  # the size of the picture, where it is not known
         camera = self.camera
         extent = np.array([camera.width or at[:, 0].max(), camera.height or at[:, 1].max()])
         frames = self.segment.frames[self.keys[pieces.key]]
-        pixels = np.array([self.odometry.tracks[f].pixels[s] for f, s in zip(frames, pieces.slot, strict=True)])
+        pixels = np.array([tracks[f].pixels[s] for f, s in zip(frames, pieces.slot, strict=True)])
         mean = np.stack([np.bincount(pieces.piece, pixels[:, i] / extent[i]) / count for i in (0, 1)])
         column, row = (mean * CELLS).astype(int).clip(0, CELLS - 1)
         middle = np.bincount(pieces.piece, pieces.key) / count

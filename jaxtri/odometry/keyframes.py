@@ -13,17 +13,17 @@ def carry(
     sensitivity: Float[Array, "d s"],
     transition: Float[Array, "d d"],
     covariance: Float[Array, "d d"],
-    information: Float[Array, "6 6"],
-    coupling: Float[Array, "6 s"],
+    information: Float[Array, "m m"],
+    coupling: Float[Array, "m s"],
 ) -> Float[Array, "d s"]:
     """The sensitivity after a prediction and an update: B <- (I - P A) F B - P C.
 
     P is the posterior `covariance`; `information` A = sum w H' D^-1 H and `coupling` C = sum w H' D^-1 J are what
-    the update's measurements say of the pose, the first six components of the error, and of the pose together with
-    the keyframes (`jaxtri.filters.projective`).
+    the update's measurements say of the first m components of the error, those of the pose at least, and of these
+    together with the keyframes (`jaxtri.filters.projective`).
     """
-    moved = transition @ sensitivity
-    return moved - covariance[:, :6] @ (information @ moved[:6] + coupling)
+    moved, m = transition @ sensitivity, len(information)
+    return moved - covariance[:, :m] @ (information @ moved[:m] + coupling)
 
 
 def total(

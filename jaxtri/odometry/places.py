@@ -128,7 +128,7 @@ def _found(
     state = _recalled(place.state, source, kept, pose)
     fresh = frame.visible & ~kept
     state, report = step_tracks(
-        settings, state, frame.u, frame.visible, fresh, 1.0, hold=np.False_, quality=frame.quality
+        settings, state, frame.u, frame.visible, fresh, 1.0, hold=np.False_, quality=frame.quality, late=frame.late
     )
     if Status(int(report.status)) is not Status.TRACKING or int(report.diagnostics.used) < fewest:
         return None

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxlie import SO3
 
+from jaxtri.geometry.camera import Camera
+from jaxtri.odometry.observing import late_s, steadied
 from jaxtri.odometry.replay import Recording
 from jaxtri.odometry.slots import Slotted
 from jaxtri.odometry.start import BasePair
@@ -31,6 +33,7 @@ class Recorder:
     pairs: list[BasePair] = field(default_factory=list)
     lost: int | None = None
     returns: dict[int, Returns] = field(default_factory=dict)
+    _steady: list[np.ndarray] = field(default_factory=list, repr=False)
 
     def take(self, tracks: Slotted, returns: Returns | None) -> None:
         """The next frame."""
@@ -38,6 +41,17 @@ class Recorder:
             if returns is not None:
                 self.returns[len(self.tracks)] = returns
             self.tracks.append(tracks)
+
+    def steady(self, camera: Camera, frame_time: float) -> list[Slotted]:
+        """The tracks so far; of a camera whose shutter rolls, as they would be at the times of the frames."""
+        if camera.readout is None:
+            return self.tracks
+        if len(self._steady) < len(self.tracks):
+            points = [(k, t.pixels, np.where(t.visible, t.ids, -1)) for k, t in enumerate(self.tracks)]
+            late = [late_s(camera, t.pixels, np.float64) / frame_time for t in self.tracks]
+            self._steady = steadied(points, late)
+        both = zip(self.tracks, self._steady, strict=True)
+        return [tracks._replace(pixels=pixels) for tracks, pixels in both]
 
     def judge(self, frame: int, moving: np.ndarray) -> None:
         """Which tracks (c,) of a frame move by themselves."""

@@ -1,7 +1,7 @@
 """Starting: a base pair of two frames, the frames between them filled in, and one frame held."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -40,6 +40,7 @@ class Observations:
         ids: (n,) number of the track in each slot.
         quality: (n, 2) forward-backward error in pixels, and smaller eigenvalue of the patch.
         returns: Which of them are tracks of earlier frames, where that was found.
+        late: (n,) frames from the time of this one to that at which each was exposed, where the shutter rolls.
     """
 
     index: int
@@ -49,6 +50,11 @@ class Observations:
     ids: np.ndarray
     quality: np.ndarray
     returns: Returns | None = None
+    late: np.ndarray | None = None
+
+    def in_frames(self, unit: float) -> "Observations":
+        """With the times of its points in frames of so many seconds, where they were in seconds."""
+        return replace(self, late=None if self.late is None else self.late / unit)
 
     def common(self, other: "Observations") -> np.ndarray:
         """Slots that hold the same track in both frames."""

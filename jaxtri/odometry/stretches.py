@@ -54,7 +54,8 @@ class Segment(NamedTuple):
     @classmethod
     def of(cls, odometry: Odometry, frames: np.ndarray, *, moving: bool = False) -> "Segment":
         """Of frames of a run, as it recorded them; with what was taken to move by itself only where that is asked."""
-        tracks: list[Slotted] = [odometry.tracks[k] for k in frames]
+        recorded = odometry.tracks
+        tracks: list[Slotted] = [recorded[k] for k in frames]
         dtype = odometry.settings.sigma.dtype  # pyright: ignore[reportOptionalMemberAccess]
         poses = [odometry.poses[k] for k in frames]
         cameras = (odometry.camera_at(p.time) for p in poses)

@@ -25,6 +25,7 @@ from jaxtri.geometry.epipolar import essential, inverse_depth, sampson
 from jaxtri.geometry.pose import identity, multiply
 from jaxtri.models.base_pairs import BasePairs, BasePoint
 from jaxtri.models.motion import Twist
+from jaxtri.models.rolling_shutter import LatePoint, RollingShutter, at_frame_time
 from jaxtri.odometry.keyframes import carry, total
 from jaxtri.odometry.measuring import (
     FARTHEST,
@@ -210,12 +211,14 @@ def step(
     *,
     hold: Bool[Array, ""] | bool = False,
     quality: Float[Array, "n 2"] | None = None,
+    late: Float[Array, " n"] | None = None,
 ) -> tuple[State, Report]:
     """One frame: predict, update with the tracks whose points are known, keep a keyframe when it is time.
 
     `observed` are normalised points in slots, `visible` the slots that hold one, `fresh` those whose track
     begins here (whatever the slot held before is forgotten). With `hold` no keyframe is made. `quality` is what
-    `settings.point_noise` asks for. Where too few points agree the state is the prediction and the status says so.
+    `settings.point_noise` asks for; `late` are the frames from the time of this one to that at which each point was
+    exposed, where the shutter rolls. Where too few points agree the state is the prediction and the status says so.
     """
     observed = jnp.where(visible[:, None], observed, jnp.zeros((), observed.dtype))
     keep = visible & ~fresh
@@ -224,7 +227,12 @@ def step(
     assumed, settings = settings, _louder(settings, state.noise)
     model, dt = _model(settings, state.depth), jnp.asarray(dt, observed.dtype)
     mask, scale = tracks.usable, noise_scale(settings, quality)
-    items = projective.prepare(model, stand_in(mask, tracks.base))
+    points = stand_in(mask, tracks.base)
+    if late is not None:
+        late = jnp.where(visible, late, jnp.zeros((), observed.dtype))
+        model = RollingShutter(model.sigma, model.acceleration, model.angular_acceleration)
+        points = LatePoint(points.point, points.spread, late)
+    items = projective.prepare(model, points)
     found = measure(settings, model, state.belief, items, observed, mask, dt, state.coasted, scale)
     belief, ok, drop = found.belief, found.taken, found.drop
     weights = jnp.where(ok, found.diagnostics.weights, 0.0)
@@ -235,6 +243,8 @@ def step(
         belief.covariance,
         *_owed(model, belief.mean, items, tracks, weights, scale),
     )
+    if late is not None:
+        observed = _at_frame_time(belief.mean, tracks, observed, late, state.depth)
     agreed = jnp.where(keep, state.agreed, 1.0)
     agreed = agreement(settings, agreed, found.diagnostics, ok & mask)
     moving = visible & (agreed < MINORITY)
@@ -301,6 +311,17 @@ def recalled(state: State, source: Int[Array, " n"], kept: Bool[Array, " n"], po
     )
 
 
+def _at_frame_time(
+    mean: Twist, tracks: Tracks, observed: Float[Array, "n 2"], late: Float[Array, " n"], depth: Float[Array, ""]
+) -> Float[Array, "n 2"]:
+    """Where points would have been at the time of the frame; one that is not known is taken to be as deep as most."""
+    X, (R, T) = tracks.base.point, (mean.pose.rotation().as_matrix(), mean.pose.translation())
+    camera = jnp.concatenate([X[:, :3] @ R.T + X[:, 3:] * T, X[:, 3:]], axis=1)
+    one = jnp.ones_like(depth)
+    guess = jnp.concatenate([observed, jnp.broadcast_to(jnp.stack([one, 1 / depth]), observed.shape)], axis=1)
+    return at_frame_time(mean, jnp.where(tracks.usable[:, None], camera, guess), observed, late)
+
+
 def _owed(
     model: BasePairs,
     mean: Twist,
@@ -308,16 +329,19 @@ def _owed(
     tracks: Tracks,
     weights: Float[Array, " n"],
     scale: Float[Array, " n"] | None,
-) -> tuple[Float[Array, "6 6"], Float[Array, "6 s"]]:
-    """What the measurements of an update say of the pose, and of the pose together with the keyframes."""
+) -> tuple[Float[Array, "m m"], Float[Array, "m s"]]:
+    """What the measurements of an update say of the m components of the error that they depend on, the pose's first.
+
+    And of these together with the keyframes.
+    """
     mask = weights > 0
     scale = replace_masked(mask, scale, 1.0)
     zero, unmeasured = jnp.zeros(12, weights.dtype), jnp.zeros((len(mask), 2), weights.dtype)
     said = projective.linearise(model, mean, zero, items, unmeasured, mask, scale)
-    each = said.coupling(weights, items.spread.reshape(4, -1, len(mask)))
+    each = said.coupling(weights, items.spread.reshape(len(items.spread), -1, len(mask)))
     lever = jnp.where(mask, tracks.lever, 0.0)
     A, _ = said.normal_equations(weights)
-    return A, -each.reshape(6, -1) @ lever.reshape(len(lever), -1).T
+    return A, -each.reshape(len(each), -1) @ lever.reshape(len(lever), -1).T
 
 
 def _only(tracks: Tracks, keep: Bool[Array, " n"]) -> Tracks:
@@ -336,6 +360,7 @@ def filter(
     *,
     hold: Bool[Array, " t"] | None = None,
     quality: Float[Array, "t n 2"] | None = None,
+    late: Float[Array, "t n"] | None = None,
     block: int = 1,
 ) -> tuple[State, Report]:
     """The state after all frames, and the reports of all stacked along a leading axis t: `step` under a scan.
@@ -348,7 +373,7 @@ def filter(
         hold = jnp.zeros(observed.shape[0], bool)
 
     def body(carry: State, frame: tuple) -> tuple[State, Report]:
-        *arguments, held, known = frame
-        return step(settings, carry, *arguments, hold=held, quality=known)
+        *arguments, held, known, late = frame
+        return step(settings, carry, *arguments, hold=held, quality=known, late=late)
 
-    return checkpointed(body, state, (observed, visible, fresh, dt, hold, quality), block)
+    return checkpointed(body, state, (observed, visible, fresh, dt, hold, quality, late), block)

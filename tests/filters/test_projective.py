@@ -13,6 +13,7 @@ from jaxtri.estimation.two_view import refine
 from jaxtri.filters import ekf, projective
 from jaxtri.models.base_pairs import BasePairs, base_point
 from jaxtri.models.motion import Twist
+from jaxtri.models.rolling_shutter import LatePoint, RollingShutter
 from jaxtri.models.trifocal import Trifocal, start
 from jaxtri.synthetic.experiment import paper_experiment
 
@@ -58,6 +59,13 @@ def base_pairs(e, view, log_sigma):
     return model, ekf.Belief(Twist(pose, jnp.zeros(6)), jnp.diag(jnp.repeat(jnp.array([1e-4, 1e-2]), 6) ** 2)), points
 
 
+def rolling(e, view, log_sigma):
+    """Each point a share of a frame late, whatever is seen there: what the moments say of it is all that is asked."""
+    model, belief, points = base_pairs(e, view, log_sigma)
+    model = RollingShutter(model.sigma, model.acceleration, model.angular_acceleration)
+    return model, belief, LatePoint(*points, jnp.linspace(-0.4, 0.4, POINTS))
+
+
 def told(e):
     """A mask with a point that is never seen and others that come and go; an outlier a frame."""
     mask = jax.random.bernoulli(jax.random.key(0), 0.8, e.observed[2:].shape[:2]).at[:, 7].set(False)
@@ -69,6 +77,7 @@ CASES = {
     "default": (partial(trifocal, base_noise=True), 4, None),
     "robust": (partial(trifocal, base_noise=True), 9, ROBUST),
     "base pairs": (base_pairs, 8, ROBUST),
+    "rolling shutter": (rolling, 8, ROBUST),
 }
 
 

@@ -523,3 +523,16 @@ def test_shared_cameras_and_trajectories_if_present():
         if (folder / "timestamps.txt").exists():
             times = formats.read_timestamps(folder / "timestamps.txt")
             assert np.isin(trajectory.times, times).all()
+
+
+@pytest.mark.parametrize(("told", "columns_rows"), [(0.02, (0.0, 0.02)), ([-0.01, 0.0], (-0.01, 0.0))])
+def test_a_readout_is_read_and_written(tmp_path, told, columns_rows):
+    entries = {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480, "readout": told}
+    camera = formats.read_camera(write(tmp_path / "camera.json", entries))
+    np.testing.assert_allclose(camera.readout, columns_rows)
+    formats.write_camera(tmp_path / "again.json", camera)
+    np.testing.assert_array_equal(formats.read_camera(tmp_path / "again.json").readout, camera.readout)
+    with pytest.raises(CameraError, match="readout is"):
+        formats.read_camera(write(tmp_path / "camera.json", entries | {"readout": [0.0, 0.01, 0.02]}))
+    with pytest.raises(CameraError, match="it is in seconds"):
+        formats.read_camera(write(tmp_path / "camera.json", entries | {"readout": 20}))

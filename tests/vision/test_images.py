@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from mp4 import change_mp4
 
-from jaxtri.cli import FROM_EXIF, Track, _camera, _Input, main
+from jaxtri.cli import main
+from jaxtri.cli.cameras import FROM_EXIF, begin_camera
+from jaxtri.cli.options import Track, _Input
 from jaxtri.errors import SourceWarning
 from jaxtri.vision.exif import read_exif
 from jaxtri.vision.images import CLOCKWISE
@@ -53,7 +55,7 @@ def test_the_search_begins_with_the_focal_length_of_the_exif(tmp_path, order):
     jpeg = cv2.imencode(".jpg", SCENE)[1].tobytes()
     (tmp_path / "0.jpg").write_bytes(with_exif(jpeg, 1, order, 28))
     with open_source(tmp_path) as source:
-        camera, prior = _camera(Track(str(tmp_path)), source, False)
+        camera, prior = begin_camera(Track(str(tmp_path)), source, False)
     # On 36 x 24 mm of film, by the diagonal.
     np.testing.assert_allclose(camera.fx, 28 * np.hypot(64, 48) / np.hypot(36, 24))
     assert source.field_of_view_deg == pytest.approx(2 * np.degrees(np.arctan(32 / float(camera.fx))))
@@ -105,7 +107,7 @@ def test_a_field_of_view_heeds_pixels_that_are_no_squares(tmp_path):
     change_mp4(tmp_path / "a.mp4", aspect=(64, 45))
     source = open_source(tmp_path / "a.mp4")
     assert (square.pixel_aspect, source.pixel_aspect) == (1, 64 / 45)
-    camera, prior = _camera(Track(str(tmp_path / "a.mp4"), fov=60.0), source, live=False)
+    camera, prior = begin_camera(Track(str(tmp_path / "a.mp4"), fov=60.0), source, live=False)
     assert prior is None
     assert float(camera.fx) == pytest.approx(32 / np.tan(np.radians(30)))
     assert float(camera.fy / camera.fx) == pytest.approx(64 / 45)
@@ -123,7 +125,7 @@ def test_a_calibration_of_the_stored_pixels_is_told_of_the_orientation(tmp_path,
     options = Track(str(tmp_path / "f"), camera=tmp_path / "c.json", input=_Input(turn_camera=90))
     with pytest.warns(SourceWarning, match="turned by 90"):
         source = open_source(tmp_path / "f")
-    turned, _ = _camera(options, source, live=False)
+    turned, _ = begin_camera(options, source, live=False)
     assert (turned.width, turned.height) == source.size
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from mp4 import change_mp4
 
-from jaxtri.cli import FROM_EXIF, Track, _camera
+from jaxtri.cli.cameras import FROM_EXIF, begin_camera
+from jaxtri.cli.options import Track
 from jaxtri.vision.quicktime import read_focal_35mm
 from jaxtri.vision.video import open_source, write_video
 
@@ -119,7 +120,7 @@ def test_the_search_begins_with_the_focal_length_of_the_film(tmp_path, clockwise
     if aspect:
         w *= aspect[0] / aspect[1]
     with open_source(path) as source:
-        camera, prior = _camera(Track(str(path)), source, False)
+        camera, prior = begin_camera(Track(str(path)), source, False)
     assert prior == FROM_EXIF
     shown = 26 * np.hypot(w, h) / np.hypot(36, 24)
     assert source.field_of_view_deg == pytest.approx(2 * np.degrees(np.arctan(w / 2 / shown)))
