@@ -270,6 +270,12 @@ def rolling_shutter(n: int, seed: int) -> Situation:
     return Situation(pinhole(), images, at(np.arange(n) / FPS), says, shown=n // 2)
 
 
+def rolling_told(n: int, seed: int) -> Situation:
+    """The same, with a camera that says so."""
+    seen = rolling_shutter(n, seed)
+    return seen._replace(camera=seen.camera.rolling(0.0, 0.020), expected="tracking; the errors as stated")
+
+
 def there_and_back(n: int, seed: int) -> Situation:
     """Along a corridor, 4 cm a frame, half looking at its wall, and back on the same way, looking the same."""
     rng, part = np.random.default_rng((seed, 5)), 5.0
