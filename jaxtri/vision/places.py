@@ -3,7 +3,9 @@
 A place is a frame whose features are kept, with a descriptor and the patch of each. One is kept whenever more than half
 of the features of the last one are gone, and is looked for among the others then. The descriptor is SIFT at the feature
 itself (Lowe 2004, section 6), upright, its roots compared (Arandjelovic & Zisserman 2012). Two features are one where
-each is the other's best match by a margin; whether their patches are one is for the flow to say.
+each is the other's best match by a margin; whether their patches are one is for the flow to say. Of many places those
+are matched that have most words in common, rare ones above all; the words are the first descriptors of the sequence
+(Sivic & Zisserman 2003).
 """
 
 from dataclasses import dataclass, field
@@ -17,8 +19,8 @@ LEFT = 0.1  # share of them that are still followed, from which the place has no
 MARGIN = 0.8  # largest distance to the best match over that to the second best. Source: Lowe 2004, section 7.1
 MOST = 256  # places that are kept; where there are more, every other one of the older half is forgotten
 FEWEST = 12  # matches that are worth to be looked at
-FIRST_LOOK = 128  # features by which the places that are worth to be matched with all are found
-LIKELY = 4  # places that are
+WORDS = 512  # descriptors by which the places are found that are worth to be matched
+LIKELY = 6  # places that are
 
 
 class Place(NamedTuple):
@@ -30,6 +32,7 @@ class Place(NamedTuple):
         pixels: (n, 2) where they are.
         descriptors: (n, 128) roots of SIFT, of unit length.
         patches: (n, side, side) about the rounded pixels.
+        words: (n,) that the descriptors are nearest to.
     """
 
     frame: int
@@ -37,6 +40,7 @@ class Place(NamedTuple):
     pixels: np.ndarray
     descriptors: np.ndarray
     patches: np.ndarray
+    words: np.ndarray
 
 
 class Returns(NamedTuple):
@@ -78,6 +82,7 @@ class Places:
 
     def __post_init__(self) -> None:
         self._sift = cv2.SIFT.create()
+        self._words = np.zeros((0, 128), np.float32)
 
     def due(self, ids: np.ndarray) -> bool:
         """Whether too little is left of the last place, for features of these numbers (n,)."""
@@ -91,7 +96,10 @@ class Places:
         points = [cv2.KeyPoint(float(x), float(y), self.size, 0.0) for x, y in pixels]
         _, found = self._sift.compute(gray, points)
         roots = np.sqrt(found / np.maximum(np.abs(found).sum(axis=1, keepdims=True), 1.0))
-        return Place(frame, ids, pixels.astype(np.float32), roots.astype(np.float16), patches)
+        if len(self._words) < WORDS:
+            self._words = np.concatenate([self._words, roots])[:WORDS]
+        words = np.argmax(roots @ self._words.T, axis=1)
+        return Place(frame, ids, pixels.astype(np.float32), roots.astype(np.float16), patches, words)
 
     def keep(self, place: Place) -> None:
         """One more."""
@@ -104,12 +112,19 @@ class Places:
         """The place, of those that have been left, that most features may be of; None where none is likely."""
         others = [p for p in self.kept if np.isin(p.ids, now.ids).sum() < LEFT * len(p.ids)]
         if len(others) > LIKELY:
-            some = np.linspace(0, len(now.ids) - 1, min(FIRST_LOOK, len(now.ids))).astype(int)
-            few = now._replace(ids=now.ids[some], descriptors=now.descriptors[some])
-            others = sorted(others, key=lambda p: len(_matched(few, p)[0]))[-LIKELY:]
+            likeness = _likeness(np.stack([np.bincount(p.words, minlength=WORDS) for p in (now, *others)]))
+            others = [others[k] for k in np.argsort(likeness)[-LIKELY:]]
         found = [Matches(p, *_matched(now, p)) for p in others]
         best = max(found, key=lambda m: len(m.now), default=None)
         return None if best is None or len(best.now) < FEWEST else best
+
+
+def _likeness(counts: np.ndarray) -> np.ndarray:
+    """Cosines between the words (p, w) of the first place and those of the others, each by how few places have it."""
+    rare = np.log(len(counts) / np.maximum((counts > 0).sum(axis=0), 1))
+    weighed = counts * rare
+    weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-9)
+    return weighed[1:] @ weighed[0]
 
 
 def _matched(now: Place, place: Place) -> tuple[np.ndarray, np.ndarray]:
