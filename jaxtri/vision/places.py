@@ -20,7 +20,7 @@ MARGIN = 0.8  # largest distance to the best match over that to the second best.
 MOST = 256  # places that are kept; where there are more, every other one of the older half is forgotten
 FEWEST = 12  # matches that are worth to be looked at
 WORDS = 512  # descriptors by which the places are found that are worth to be matched
-LIKELY = 6  # places that are
+LIKELY = 8  # places that are
 
 
 class Place(NamedTuple):
@@ -132,8 +132,11 @@ def _matched(now: Place, place: Place) -> tuple[np.ndarray, np.ndarray]:
     like = now.descriptors.astype(np.float32) @ place.descriptors.astype(np.float32).T
     if min(like.shape) < 2:
         return np.zeros(0, int), np.zeros(0, int)
-    distance = np.sqrt(np.maximum(2 - 2 * like, 0.0))
-    before, rows = np.argmin(distance, axis=1), np.arange(len(distance))
-    best, second = np.partition(distance, 1, axis=1)[:, :2].T
-    mutual = (np.argmin(distance, axis=0)[before] == rows) & (best < MARGIN * second)
-    return rows[mutual], before[mutual]
+    before, rows = np.argmax(like, axis=1), np.arange(len(like))
+    mutual = np.argmax(like, axis=0)[before] == rows
+    rows, before = rows[mutual], before[mutual]
+    others = like[rows]
+    others[np.arange(len(rows)), before] = -1.0
+    # Squared distances of unit vectors are 2 - 2 times their product.
+    clear = 1 - like[rows, before] < MARGIN**2 * (1 - others.max(axis=1, initial=-1.0))
+    return rows[clear], before[clear]
