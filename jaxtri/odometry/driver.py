@@ -272,16 +272,15 @@ class Odometry(Archived):
     def _take_in(self, newest: float, most: float) -> np.ndarray:
         """Up to `most` queued frames, in order, but none before a start is there; the numbers of tracks to give up."""
         outliers: list[np.ndarray] = []
+        # A place that is seen again is better than a start, which need not be waited for.
+        if self._seeking and self._queue[-1:] and self._queue[-1].index == newest and self._find_again(self._queue[-1]):
+            self._queue.clear()
         while True:
             if self._seeking:
                 search = self._search = self._search or beside(self._begin, "start")
                 if newest < self._waiting[-1].index + self._start.lag:
                     break
-                again = next((k for k, f in enumerate(self._queue) if self._find_again(f)), None)
-                if again is None:
-                    self._settle(search.result())
-                else:
-                    del self._queue[: again + 1]
+                self._settle(search.result())
             if not self._queue or len(outliers) >= most:
                 break
             frame = self._queue.pop(0)

@@ -112,6 +112,24 @@ def test_what_was_followed_between_is_called_uncertain():
     assert all(p.start == 0 for p in odometry.poses[late:])
 
 
+def test_a_start_that_is_worked_out_is_not_waited_for(found):
+    """Once a place is seen again the newest pose is there, and the frames that queued stay without one."""
+    tracks, _ = found
+    odometry, late = Odometry(tracks.camera, capacity=CAPACITY), FRAMES - 3
+    feed(odometry, tracks, range(BACK))
+    told = returns(tracks, late, LEFT - 1)
+    for k in range(BACK, late + 1):
+        ids, back = np.arange(CAPACITY) + NEW, told if k == late else None
+        odometry.add(tracks.pixels[k], tracks.visible[k], float(k), ids=ids, returns=back)
+        if k == late - 1:
+            assert odometry.latest.time < late - 1  # the start has begun: frames queue
+    assert odometry.latest.time == late
+    assert odometry.latest.status is Status.FOUND
+    assert not odometry.lost
+    assert odometry.starts == 1
+    assert {p.status for p in odometry.poses[BACK:late]} == {Status.LOST}
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
