@@ -125,7 +125,7 @@ class KLT:
         self._bars = Bars()
         self._overlays: Overlays | None = None
         self._dissolves, self._shot = Dissolves(), 0  # the first frame of the present shot, so far as is known
-        self._places = Places(self.settings.window / 2)
+        self._places = Places()
 
     def track(self, image: np.ndarray, ignore: np.ndarray | None = None) -> FrameTracks:
         """Follow all features into `image` (h, w) or (h, w, 3) uint8, and fill the free slots.

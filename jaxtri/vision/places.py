@@ -1,11 +1,11 @@
 """Places that were seen before: the features of some frames are described, and found again in later ones.
 
 A place is a frame whose features are kept, with a descriptor and the patch of each. One is kept whenever more than half
-of the features of the last one are gone, and is looked for among the others then. The descriptor is SIFT at the feature
-itself (Lowe 2004, section 6), upright, its roots compared (Arandjelovic & Zisserman 2012). Two features are one where
-each is the other's best match by a margin; whether their patches are one is for the flow to say. Of many places those
-are matched that have most words in common, rare ones above all; the words are the first descriptors of the sequence
-(Sivic & Zisserman 2003).
+of the features of the last one are gone, and is looked for among the others then. The descriptor is ORB's at the
+feature itself, upright: a pattern of comparisons, 256 bits (Rublee et al. 2011). Two features are one where each is the
+other's best match by a margin; whether their patches are one is for the flow to say. Of many places those are matched
+that have most words in common, rare ones above all; the words are the first descriptors of the sequence (Sivic &
+Zisserman 2003).
 """
 
 from dataclasses import dataclass, field
@@ -20,7 +20,8 @@ MARGIN = 0.8  # largest distance to the best match over that to the second best.
 MOST = 256  # places that are kept; where there are more, every other one of the older half is forgotten
 FEWEST = 12  # matches that are worth to be looked at
 WORDS = 512  # descriptors by which the places are found that are worth to be matched
-LIKELY = 8  # places that are
+LIKELY = 2  # places that are
+ACROSS = 31.0  # pixels of a picture that are compared
 
 
 class Place(NamedTuple):
@@ -30,7 +31,7 @@ class Place(NamedTuple):
         frame: Its number.
         ids: (n,) numbers of the features.
         pixels: (n, 2) where they are.
-        descriptors: (n, 128) roots of SIFT, of unit length.
+        descriptors: (n, 32) uint8, of bits.
         patches: (n, side, side) about the rounded pixels.
         words: (n,) that the descriptors are nearest to.
     """
@@ -73,16 +74,15 @@ class Places:
     """The places of a sequence.
 
     Attributes:
-        size: Of a feature, in pixels: its descriptor is six times as wide.
         kept: Those that are kept, in order.
     """
 
-    size: float
     kept: list[Place] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._sift = cv2.SIFT.create()
-        self._words = np.zeros((0, 128), np.float32)
+        # One level, and no edge at which features are left out: they are given, and the picture is reflected there.
+        self._orb = cv2.ORB.create(nlevels=1, edgeThreshold=0, patchSize=int(ACROSS))
+        self._words = np.zeros((0, 32), np.uint8)
 
     def due(self, ids: np.ndarray) -> bool:
         """Whether too little is left of the last place, for features of these numbers (n,)."""
@@ -93,13 +93,14 @@ class Places:
 
     def place(self, frame: int, gray: np.ndarray, ids: np.ndarray, pixels: np.ndarray, patches: np.ndarray) -> Place:
         """The features of a frame, described."""
-        points = [cv2.KeyPoint(float(x), float(y), self.size, 0.0) for x, y in pixels]
-        _, found = self._sift.compute(gray, points)
-        roots = np.sqrt(found / np.maximum(np.abs(found).sum(axis=1, keepdims=True), 1.0))
+        points = [cv2.KeyPoint(float(x), float(y), ACROSS, 0.0, 0.0, 0, k) for k, (x, y) in enumerate(pixels)]
+        there, found = self._orb.compute(gray, points)
+        described = np.zeros((len(ids), 32), np.uint8)
+        described[[point.class_id for point in there]] = found
         if len(self._words) < WORDS:
-            self._words = np.concatenate([self._words, roots])[:WORDS]
-        words = np.argmax(roots @ self._words.T, axis=1)
-        return Place(frame, ids, pixels.astype(np.float32), roots.astype(np.float16), patches, words)
+            self._words = np.concatenate([self._words, described])[:WORDS]
+        words = np.array([match.trainIdx for match in _MATCHER.match(described, self._words)], int)
+        return Place(frame, ids, pixels.astype(np.float32), described, patches, words)
 
     def keep(self, place: Place) -> None:
         """One more."""
@@ -127,16 +128,13 @@ def _likeness(counts: np.ndarray) -> np.ndarray:
     return weighed[1:] @ weighed[0]
 
 
+_MATCHER = cv2.BFMatcher(cv2.NORM_HAMMING)
+
+
 def _matched(now: Place, place: Place) -> tuple[np.ndarray, np.ndarray]:
     """Rows of either that are each other's best match by a margin."""
-    like = now.descriptors.astype(np.float32) @ place.descriptors.astype(np.float32).T
-    if min(like.shape) < 2:
-        return np.zeros(0, int), np.zeros(0, int)
-    before, rows = np.argmax(like, axis=1), np.arange(len(like))
-    mutual = np.argmax(like, axis=0)[before] == rows
-    rows, before = rows[mutual], before[mutual]
-    others = like[rows]
-    others[np.arange(len(rows)), before] = -1.0
-    # Squared distances of unit vectors are 2 - 2 times their product.
-    clear = 1 - like[rows, before] < MARGIN**2 * (1 - others.max(axis=1, initial=-1.0))
-    return rows[clear], before[clear]
+    two = _MATCHER.knnMatch(now.descriptors, place.descriptors, k=2)
+    clear = [best for best, *other in two if other and best.distance < MARGIN * other[0].distance]
+    rows, before = (np.array([getattr(m, of) for m in clear], int) for of in ("queryIdx", "trainIdx"))
+    back = np.array([m.trainIdx for m in _MATCHER.match(place.descriptors[before], now.descriptors)], int)
+    return rows[back == rows], before[back == rows]
